@@ -1,0 +1,27 @@
+use std::path::PathBuf;
+
+use barchan_geometry::GeometryError;
+
+/// Why a dataset cannot be read. Each message names the file and the cure.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// The dataset's specification or layout is not understood.
+    #[error("{spec}: {message}")]
+    Layout {
+        /// What was asked for.
+        spec: String,
+        /// What was looked for and not found, and what to do.
+        message: String,
+    },
+    /// A file of the dataset is missing, damaged or of another size.
+    #[error("{path}: {message}")]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it and what to do.
+        message: String,
+    },
+    /// The rig or a trajectory of the dataset is wrong.
+    #[error(transparent)]
+    Geometry(#[from] GeometryError),
+}

@@ -1,0 +1,68 @@
+use barchan_geometry::{RectifiedRig, Trajectory};
+use image::{ImageBuffer, Luma, Rgb32FImage};
+
+use crate::DataError;
+
+/// A colour image, `f32` in 0..=1. Grey sources have three equal channels.
+pub type Rgb = Rgb32FImage;
+
+/// One number a pixel: a disparity image, a confidence, a grey image. NaN is "not known".
+pub type Plane = ImageBuffer<Luma<f32>, Vec<f32>>;
+
+/// A rectified stereo pair.
+#[derive(Clone, Debug)]
+pub struct StereoFrame {
+    /// Position in its sequence, from 0.
+    pub index: usize,
+    /// The file stem of its images, or a number of six digits.
+    pub name: String,
+    /// Seconds; the index where the source knows no times.
+    pub time: f64,
+    /// The left image.
+    pub left: Rgb,
+    /// The right image, of the same size, its rows corresponding.
+    pub right: Rgb,
+}
+
+/// A sequence of rectified stereo pairs. One implementation per format.
+pub trait StereoSource: Send + Sync {
+    /// The rig that every frame obeys.
+    fn rig(&self) -> &RectifiedRig;
+
+    /// How many frames there are.
+    fn len(&self) -> usize;
+
+    /// Whether there are none. (A source that opens has at least one.)
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Reads (or renders) frame `index`.
+    ///
+    /// # Errors
+    /// When a file is missing, damaged or of another size; the message names it.
+    fn frame(&self, index: usize) -> Result<StereoFrame, DataError>;
+
+    /// True disparity of the left image of frame `index`, NaN where not known.
+    ///
+    /// # Errors
+    /// When there is truth but it cannot be read.
+    fn true_disparity(&self, index: usize) -> Result<Option<Plane>, DataError> {
+        let _ = index;
+        Ok(None)
+    }
+
+    /// The true trajectory of the left camera, one pose a frame, when it is known. Planar truth
+    /// (`gt.csv`) stands with z = 0 and no rotation.
+    fn true_trajectory(&self) -> Option<&Trajectory> {
+        None
+    }
+}
+
+/// Luminance by the BT.601 weights.
+pub fn luma(image: &Rgb) -> Plane {
+    let data = image.as_raw().chunks_exact(3).map(|p| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2]);
+    let (width, height) = image.dimensions();
+    // The buffer has one value a pixel by construction.
+    Plane::from_raw(width, height, data.collect()).unwrap_or_default()
+}

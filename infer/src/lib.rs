@@ -1,0 +1,15 @@
+//! Disparity engines: a rectified pair in; disparity, standard deviation and confidence out.
+//!
+//! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
+//! line see disparity, whoever makes it; [`Rejection`], which marks as unknown what the pair itself
+//! contradicts. Engines stand behind features: `burn`, `onnxruntime`.
+//!
+//! What it promises: any image size; disparity positive (`x_right = x_left - d`), NaN is unknown.
+//!
+//! What it never does: train, or know where images come from.
+
+mod engine;
+mod rejection;
+
+pub use engine::{DisparityEngine, DisparityMap, InferError};
+pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};

@@ -1,0 +1,108 @@
+use barchan_datasets::{Plane, Rgb, luma};
+use rayon::prelude::*;
+
+use crate::DisparityMap;
+
+/// Marks as unknown the pixels that the pair itself contradicts (Hong 2021, 4.2.1): the right
+/// image, warped by the disparity, must look like the left.
+///
+/// The paper prints "L_SSIM values less than 0.4 are rejected" with L_SSIM = (1 - SSIM) / 2, which
+/// read literally keeps the worst pixels. What is meant, and done here, is the reverse: a pixel
+/// whose *dis*similarity exceeds the threshold is rejected. Pixels that fall outside the right
+/// image cannot be checked and are rejected too.
+#[derive(Clone, Copy, Debug)]
+pub struct Rejection {
+    /// Largest accepted (1 - SSIM) / 2.
+    pub max_dissimilarity: f32,
+}
+
+impl Default for Rejection {
+    fn default() -> Self {
+        Self { max_dissimilarity: 0.4 }
+    }
+}
+
+impl Rejection {
+    /// Sets rejected pixels of `map` to NaN and returns the share that is left.
+    pub fn apply(&self, left: &Rgb, right: &Rgb, map: &mut DisparityMap) -> f64 {
+        let warped = warp_right_to_left(&luma(right), &map.disparity);
+        let dissimilarity = structural_dissimilarity(&luma(left), &warped);
+        for (d, s) in map.disparity.iter_mut().zip(dissimilarity.iter()) {
+            // NaN, where the warp fell outside, is not below the threshold either.
+            if !(*s <= self.max_dissimilarity) {
+                *d = f32::NAN;
+            }
+        }
+        map.density()
+    }
+}
+
+/// The right image as the left camera would see it: sampled at `x - d`, linearly. NaN where the
+/// disparity is unknown or points outside the right image.
+pub fn warp_right_to_left(right: &Plane, disparity: &Plane) -> Plane {
+    let (width, height) = disparity.dimensions();
+    let (w, source) = (width as usize, right.as_raw());
+    let mut warped = vec![f32::NAN; w * height as usize];
+    warped.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+        for (x, out) in row.iter_mut().enumerate() {
+            let at = x as f32 - disparity.as_raw()[y * w + x];
+            if !(at >= 0.0 && at <= (w - 1) as f32) {
+                continue;
+            }
+            let x0 = at as usize;
+            let a = at - x0 as f32;
+            let next = source[y * w + (x0 + 1).min(w - 1)];
+            *out = (1.0 - a) * source[y * w + x0] + a * next;
+        }
+    });
+    // One value a pixel by construction.
+    Plane::from_raw(width, height, warped).unwrap_or_default()
+}
+
+/// (1 - SSIM) / 2 per pixel over 7x7 windows (Hong 2021, eq. 2; Wang 2004 for SSIM), 0 for equal
+/// and 1 for opposite structure. A window takes the pixels known in both images; where its centre
+/// is unknown the result is NaN.
+pub fn structural_dissimilarity(a: &Plane, b: &Plane) -> Plane {
+    const RADIUS: usize = 3;
+    const C1: f32 = 0.01 * 0.01;
+    const C2: f32 = 0.03 * 0.03;
+    let (width, height) = a.dimensions();
+    let (w, h) = (width as usize, height as usize);
+    let (pa, pb) = (a.as_raw(), b.as_raw());
+    let mut out = vec![f32::NAN; w * h];
+    out.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+        // Sums over the window's rows, one set per column; the window then slides along x.
+        let columns: Vec<[f32; 6]> = (0..w)
+            .map(|x| {
+                let mut s = [0.0; 6];
+                for yy in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(h) {
+                    let (va, vb) = (pa[yy * w + x], pb[yy * w + x]);
+                    if va.is_finite() && vb.is_finite() {
+                        for (sum, term) in s.iter_mut().zip([1.0, va, vb, va * va, vb * vb, va * vb]) {
+                            *sum += term;
+                        }
+                    }
+                }
+                s
+            })
+            .collect();
+        for x in 0..w {
+            if !(pa[y * w + x].is_finite() && pb[y * w + x].is_finite()) {
+                continue;
+            }
+            let mut s = [0.0; 6];
+            for column in &columns[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(w)] {
+                for (sum, term) in s.iter_mut().zip(column) {
+                    *sum += term;
+                }
+            }
+            let n = s[0];
+            let (ma, mb) = (s[1] / n, s[2] / n);
+            let (va, vb) = ((s[3] / n - ma * ma).max(0.0), (s[4] / n - mb * mb).max(0.0));
+            let cov = s[5] / n - ma * mb;
+            let ssim = ((2.0 * ma * mb + C1) * (2.0 * cov + C2)) / ((ma * ma + mb * mb + C1) * (va + vb + C2));
+            row[x] = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
+        }
+    });
+    Plane::from_raw(width, height, out).unwrap_or_default()
+}
