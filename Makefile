@@ -1,0 +1,70 @@
+# Every target sets up what it needs. Wanted of the machine: a Rust toolchain (cargo, clippy,
+# rustfmt), Python 3 with pip, a C compiler, and the crates and Python package registries.
+#
+# Everything is compiled once, in the release profile and for the whole workspace: the network
+# library takes about nine minutes on two cores, and any other choice of profile or of features
+# would compile it again. The build folder lies in the user's cache, shared by all checkouts.
+
+SHELL  := bash
+CACHE  := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/barchan
+PYTHON ?= python3
+
+CARGO_TARGET_DIR ?= $(CACHE)/target
+export CARGO_TARGET_DIR
+# Where the cargo commands get further flags, such as --locked.
+CARGO_FLAGS ?=
+CARGO_BUILD  = --release --workspace $(CARGO_FLAGS)
+
+BARCHAN := $(CARGO_TARGET_DIR)/release/barchan
+# What `make run` works on, and where it writes.
+DATA = synth:seed=1,frames=40
+OUT  = runs/demo
+
+PEERS := $(CACHE)/peers-$(shell sha256sum tests/peers/requirements.txt | cut -c 1-12)
+
+.DEFAULT_GOAL := help
+.PHONY: help build run test bench lint smoke peers onnxruntime libtorch sample-data clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
+
+build: ## the barchan program
+	cargo build $(CARGO_BUILD)
+
+run: build onnxruntime ## the main job: train, export, infer, slam, map; DATA=folder:PATH for your images, OUT=DIR
+	scripts/main-job.sh "$(BARCHAN)" "$(DATA)" "$(OUT)"
+
+test: onnxruntime ## every test
+	cargo test $(CARGO_BUILD)
+
+smoke: onnxruntime ## train for a moment on each CPU device, export, ONNX Runtime against Burn
+	cargo test $(CARGO_BUILD) --test smoke -- --nocapture
+
+lint: ## format, clippy and documentation, warnings denied
+	cargo fmt --all --check
+	cargo clippy $(CARGO_BUILD) --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_BUILD) --no-deps
+
+bench: onnxruntime ## criterion benches
+	cargo bench --workspace $(CARGO_FLAGS)
+
+peers: build onnxruntime $(PEERS)/ready ## outputs against other people's programs: ONNX Runtime, evo, GDAL, OpenCV
+	$(PEERS)/bin/python tests/peers/run.py --barchan "$(BARCHAN)"
+
+$(PEERS)/ready: tests/peers/requirements.txt
+	$(PYTHON) -m venv --clear $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --no-deps --only-binary :all: --requirement $<
+	touch $@
+
+onnxruntime: ## ONNX Runtime's library into the cache, where barchan looks for it
+	@$(PYTHON) scripts/onnxruntime.py
+
+libtorch: ## libtorch into the cache, for the optional tch device (0.9 GB to fetch, 0.5 GB kept)
+	@$(PYTHON) scripts/libtorch.py
+
+sample-data: ## Middlebury's Motorcycle, a real pair with true disparity, into data/
+	@$(PYTHON) scripts/sample_data.py data
+
+clean: ## removes runs/demo, runs/peers, the sample data and what was compiled of barchan itself
+	rm -rf runs/demo runs/peers data/motorcycle data/middlebury2014/trainingQ/Motorcycle
+	cargo clean --workspace

@@ -1,0 +1,82 @@
+"""barchan's outputs against programs nobody here wrote. `make peers` runs this.
+
+Trains for a moment on a rendered traverse, exports, infers, tracks and maps, and holds every file
+against ONNX Runtime, onnx, evo, GDAL, OpenCV and plyfile. Real images and published trajectories
+join where ../shared/data has them. Exits 1 when a figure is out of bounds or a check fails to run.
+"""
+
+import argparse
+import shutil
+import sys
+import traceback
+from pathlib import Path
+
+import files
+import network
+import rasters
+import trajectory
+from common import Barchan, Table
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--barchan", type=Path, required=True, help="the built program")
+    parser.add_argument("--work", type=Path, default=ROOT / "runs" / "peers", help="folder for what is made")
+    options = parser.parse_args()
+    barchan, work, shared = Barchan(options.barchan), options.work, ROOT.parent / "shared" / "data"
+
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    data, run, model = work / "data", work / "train", work / "model.onnx"
+    if not shared.is_dir():
+        print(f"skipped: real images and published trajectories (no {shared})")
+
+    def prepare(table: Table) -> None:
+        barchan("data", "synth", "synth:seed=5,frames=12", "--out", data)
+        barchan("train", "--data", f"folder:{data}", "--preset", "tiny", "--steps", 40, "--out", run)
+        barchan("export", run, "--out", model)
+        barchan("infer", "--data", f"folder:{data}", "--model", model, "--out", work / "infer")
+        barchan("slam", "--data", f"folder:{data}", "--model", model, "--out", work / "slam")
+        barchan("map", work / "slam", "--out", work / "map")
+
+    def exported(table: Table) -> None:
+        network.check_file(table, model)
+
+    def engines(table: Table) -> None:
+        (weights,) = run.glob("*.safetensors")
+        cases = network.cases(data, shared, work)
+        network.check_disparity(table, barchan, model, weights, cases, work)
+
+    def trajectories(table: Table) -> None:
+        cases = {
+            "made up": trajectory.made_up_case(work),
+            "synth": (work / "slam" / "trajectory.tum", data / "groundtruth.tum"),
+            **trajectory.kitti_cases(shared, work),
+        }
+        for name, (estimate, truth) in cases.items():
+            trajectory.check(table, barchan, name, estimate, truth)
+
+    def terrain(table: Table) -> None:
+        rasters.check(table, work / "map")
+
+    def formats(table: Table) -> None:
+        files.check_disparity(table, work / "infer")
+        files.check_frame_clouds(table, work / "infer", data)
+        files.check_cloud(table, work / "slam" / "map.ply")
+        files.check_cloud(table, work / "map" / "cloud.ply")
+
+    table = Table()
+    for part in (prepare, exported, engines, trajectories, terrain, formats):
+        try:
+            part(table)
+        except Exception as error:  # One part that cannot run must not hide the others' figures.
+            traceback.print_exc()
+            table.line(f"{part.__name__} could not run", type(error).__name__, "", False)
+    print(f"{table.rows - table.bad} passed, {table.bad} failed")
+    sys.exit(1 if table.bad else 0)
+
+
+if __name__ == "__main__":
+    main()
