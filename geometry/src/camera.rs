@@ -48,7 +48,13 @@ fn pinhole() -> String {
 impl Camera {
     /// A camera without distortion.
     pub fn pinhole(fx: f64, fy: f64, cx: f64, cy: f64) -> Self {
-        Self { fx, fy, cx, cy, distortion: Distortion::Pinhole }
+        Self {
+            fx,
+            fy,
+            cx,
+            cy,
+            distortion: Distortion::Pinhole,
+        }
     }
 
     /// The pixel at which a point of the camera frame appears; `None` behind the camera.
@@ -57,7 +63,10 @@ impl Camera {
             return None;
         }
         let bent = self.distort(Vector2::new(p_cam.x / p_cam.z, p_cam.y / p_cam.z));
-        Some(Vector2::new(self.fx * bent.x + self.cx, self.fy * bent.y + self.cy))
+        Some(Vector2::new(
+            self.fx * bent.x + self.cx,
+            self.fy * bent.y + self.cy,
+        ))
     }
 
     /// Bends normalised image coordinates as the lens does.
@@ -85,6 +94,27 @@ impl Camera {
         }
     }
 
+    /// The radius of normalised coordinates up to which the lens model is one to one: beyond it
+    /// the radial polynomial folds back and far rays would appear inside the image.
+    pub(crate) fn folds_at(&self) -> f64 {
+        let slope = |r: f64| match self.distortion {
+            Distortion::Pinhole => 1.0,
+            Distortion::RadTan([k1, k2, _, _, k3]) => {
+                let r2 = r * r;
+                1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3))
+            }
+            Distortion::Equidistant([k1, k2, k3, k4]) => {
+                let t2 = r.atan().powi(2);
+                1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+            }
+        };
+        // A ray of radius 10 stands 84 degrees off the axis: no rectified image reaches further.
+        (0..1000)
+            .map(|i| f64::from(i) * 0.01)
+            .find(|r| slope(*r) <= 0.0)
+            .unwrap_or(f64::INFINITY)
+    }
+
     /// The normalised coordinates whose [`Camera::distort`] is `bent`, by fixed-point iteration
     /// (as OpenCV's `undistortPoints`). Converges for lenses that are one to one over the image.
     pub fn undistort(&self, bent: Vector2<f64>) -> Vector2<f64> {
@@ -101,7 +131,10 @@ impl Camera {
 
     /// The normalised ray (z = 1) through a pixel.
     pub fn ray(&self, pixel: Vector2<f64>) -> Vector2<f64> {
-        self.undistort(Vector2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy))
+        self.undistort(Vector2::new(
+            (pixel.x - self.cx) / self.fx,
+            (pixel.y - self.cy) / self.fy,
+        ))
     }
 
     pub(crate) fn from_toml(toml: &CameraToml) -> Result<Self, String> {
@@ -118,10 +151,18 @@ impl Camera {
                 ));
             }
             (other, _) => {
-                return Err(format!("model \"{other}\" is not one of pinhole, radtan, equidistant"));
+                return Err(format!(
+                    "model \"{other}\" is not one of pinhole, radtan, equidistant"
+                ));
             }
         };
-        Ok(Self { fx: toml.fx, fy: toml.fy, cx: toml.cx, cy: toml.cy, distortion })
+        Ok(Self {
+            fx: toml.fx,
+            fy: toml.fy,
+            cx: toml.cx,
+            cy: toml.cy,
+            distortion,
+        })
     }
 
     pub(crate) fn to_toml(self) -> CameraToml {
@@ -150,7 +191,10 @@ mod tests {
         let katwijk = Distortion::RadTan([-0.360, 0.169, 0.001, -0.0005, -0.02]);
         let fisheye = Distortion::Equidistant([-0.01, 0.02, -0.003, 0.0005]);
         for distortion in [Distortion::Pinhole, katwijk, fisheye] {
-            let camera = Camera { distortion, ..Camera::pinhole(800.0, 810.0, 500.0, 400.0) };
+            let camera = Camera {
+                distortion,
+                ..Camera::pinhole(800.0, 810.0, 500.0, 400.0)
+            };
             for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.4)] {
                 let n = Vector2::new(x, y);
                 let back = camera.undistort(camera.distort(n));
@@ -162,13 +206,26 @@ mod tests {
     #[test]
     fn radtan_matches_a_value_worked_by_hand() {
         // x=0.5 y=0.25, r2=0.3125, radial=1+0.1*0.3125-0.05*0.3125^2
-        let camera =
-            Camera { distortion: Distortion::RadTan([0.1, -0.05, 0.01, 0.02, 0.0]), ..Camera::pinhole(1.0, 1.0, 0.0, 0.0) };
+        let camera = Camera {
+            distortion: Distortion::RadTan([0.1, -0.05, 0.01, 0.02, 0.0]),
+            ..Camera::pinhole(1.0, 1.0, 0.0, 0.0)
+        };
         let radial: f64 = 1.0 + 0.03125 - 0.05 * 0.09765625;
         let x = 0.5 * radial + 2.0 * 0.01 * 0.125 + 0.02 * (0.3125 + 0.5);
         let y = 0.25 * radial + 0.01 * (0.3125 + 0.125) + 2.0 * 0.02 * 0.125;
         let got = camera.distort(Vector2::new(0.5, 0.25));
         assert!((got - Vector2::new(x, y)).norm() < 1e-15);
+    }
+
+    #[test]
+    fn a_lens_folds_where_its_radius_turns_back() {
+        let camera = |k| Camera {
+            distortion: Distortion::RadTan([k, 0.0, 0.0, 0.0, 0.0]),
+            ..Camera::pinhole(1.0, 1.0, 0.0, 0.0)
+        };
+        // d/dr (r + k r^3) = 0 at r = 1/sqrt(-3 k).
+        assert!((camera(-0.3).folds_at() - (1.0f64 / 0.9).sqrt()).abs() < 0.011);
+        assert_eq!(camera(0.3).folds_at(), f64::INFINITY);
     }
 
     #[test]

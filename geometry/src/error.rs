@@ -12,7 +12,9 @@ pub enum GeometryError {
         source: std::io::Error,
     },
     /// `rig.toml` is not TOML, or lacks a field.
-    #[error("{path}: not a rig file: {message}\n  cure: see `rig.toml` in the README for every field")]
+    #[error(
+        "{path}: not a rig file: {message}\n  cure: see `rig.toml` in the README for every field"
+    )]
     RigSyntax {
         /// The file.
         path: PathBuf,
@@ -45,6 +47,9 @@ pub enum GeometryError {
 
 impl GeometryError {
     pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
-        move |source| Self::Io { path: path.to_owned(), source }
+        move |source| Self::Io {
+            path: path.to_owned(),
+            source,
+        }
     }
 }

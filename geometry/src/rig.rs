@@ -8,6 +8,7 @@ use crate::{GeometryError, Se3};
 
 /// Two cameras and their relative pose, as calibrated.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(non_snake_case)]
 pub struct Rig {
     /// Image width, pixels.
     pub width: usize,
@@ -84,8 +85,10 @@ impl Rig {
     /// negative focal length, a rotation that is none); the message names file and field.
     pub fn load(path: &Path) -> Result<Self, GeometryError> {
         let text = std::fs::read_to_string(path).map_err(GeometryError::io(path))?;
-        let toml: RigToml = toml::from_str(&text)
-            .map_err(|e| GeometryError::RigSyntax { path: path.to_owned(), message: e.to_string() })?;
+        let toml: RigToml = toml::from_str(&text).map_err(|e| GeometryError::RigSyntax {
+            path: path.to_owned(),
+            message: e.to_string(),
+        })?;
         let bad = |field, value: String, expected| GeometryError::RigValue {
             path: path.to_owned(),
             field,
@@ -95,26 +98,46 @@ impl Rig {
         let camera = |field, c: &CameraToml| {
             for value in [c.fx, c.fy] {
                 if !(value.is_finite() && value > 0.0) {
-                    return Err(bad(field, format!("focal length {value}"), "a positive number of pixels"));
+                    return Err(bad(
+                        field,
+                        format!("focal length {value}"),
+                        "a positive number of pixels",
+                    ));
                 }
             }
-            if !(c.cx.is_finite() && c.cy.is_finite() && c.distortion.iter().all(|k| k.is_finite())) {
+            if !(c.cx.is_finite() && c.cy.is_finite() && c.distortion.iter().all(|k| k.is_finite()))
+            {
                 return Err(bad(field, "not finite".into(), "finite numbers"));
             }
             Camera::from_toml(c).map_err(|value| bad(field, value, "a known camera model"))
         };
         if toml.width == 0 || toml.height == 0 {
-            return Err(bad("width, height", format!("{} x {}", toml.width, toml.height), "an image size"));
+            return Err(bad(
+                "width, height",
+                format!("{} x {}", toml.width, toml.height),
+                "an image size",
+            ));
         }
         let left = camera("[left]", &toml.left)?;
-        let right = toml.right.as_ref().map_or(Ok(left), |c| camera("[right]", c))?;
+        let right = toml
+            .right
+            .as_ref()
+            .map_or(Ok(left), |c| camera("[right]", c))?;
         let t_right_left = match (&toml.right_from_left, toml.baseline) {
             (Some(pose), _) => pose.to_se3().ok_or_else(|| {
-                bad("[right_from_left] rotation", format!("{:?}", pose.rotation), "an orthonormal matrix of determinant 1")
+                bad(
+                    "[right_from_left] rotation",
+                    format!("{:?}", pose.rotation),
+                    "an orthonormal matrix of determinant 1",
+                )
             })?,
             (None, Some(baseline)) => Se3::translation(-baseline, 0.0, 0.0),
             (None, None) => {
-                return Err(bad("baseline", "missing".into(), "metres between the cameras, or [right_from_left]"));
+                return Err(bad(
+                    "baseline",
+                    "missing".into(),
+                    "metres between the cameras, or [right_from_left]",
+                ));
             }
         };
         let rig = Self {
@@ -128,10 +151,38 @@ impl Rig {
         let baseline = rig.baseline();
         if !(baseline.is_finite() && baseline > 1e-6) || toml.baseline.is_some_and(|b| b <= 0.0) {
             let value = toml.baseline.unwrap_or(baseline);
-            return Err(bad("baseline", value.to_string(), "the distance between the cameras in metres, above zero"));
+            return Err(bad(
+                "baseline",
+                value.to_string(),
+                "the distance between the cameras in metres, above zero",
+            ));
+        }
+        let across = -rig.T_right_left.translation.x / baseline;
+        if across < 0.7 {
+            let value = format!("{:?}", rig.T_right_left.translation.vector.as_slice());
+            return Err(bad(
+                "[right_from_left] translation",
+                value,
+                "mostly along -x: it maps left-camera points to a right camera that stands to the right",
+            ));
+        }
+        if rig.rectified && (rig.T_right_left.rotation.angle() > 1e-6 || across < 1.0 - 1e-9) {
+            let value = format!(
+                "{:.3} degrees of rotation",
+                rig.T_right_left.rotation.angle().to_degrees()
+            );
+            return Err(bad(
+                "[right_from_left]",
+                value,
+                "a shift along x, as rectified = true",
+            ));
         }
         if rig.rectified && rig.left.fy != rig.right.fy {
-            return Err(bad("[right] fy", rig.right.fy.to_string(), "that of [left], as rectified = true"));
+            return Err(bad(
+                "[right] fy",
+                rig.right.fy.to_string(),
+                "that of [left], as rectified = true",
+            ));
         }
         Ok(rig)
     }
@@ -181,7 +232,8 @@ impl PoseToml {
     fn to_se3(&self) -> Option<Se3> {
         let r = Matrix3::from_fn(|i, j| self.rotation[i][j]);
         let t = Vector3::from(self.translation);
-        let orthonormal = (r * r.transpose() - Matrix3::identity()).norm() < 1e-4 && r.determinant() > 0.0;
+        let orthonormal =
+            (r * r.transpose() - Matrix3::identity()).norm() < 1e-4 && r.determinant() > 0.0;
         (orthonormal && t.iter().all(|v| v.is_finite())).then(|| {
             let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&r));
             Se3::from_parts(Translation3::from(t), rotation)
@@ -212,8 +264,13 @@ impl RectifiedRig {
     /// `None` where the disparity puts it at infinity or behind.
     pub fn back_project(&self, at: StereoPoint) -> Option<Point3<f64>> {
         let z = self.depth(at.d);
-        (z.is_finite() && z > 0.0)
-            .then(|| Point3::new((at.u - self.cx) / self.fx * z, (at.v - self.cy) / self.fy * z, z))
+        (z.is_finite() && z > 0.0).then(|| {
+            Point3::new(
+                (at.u - self.cx) / self.fx * z,
+                (at.v - self.cy) / self.fy * z,
+                z,
+            )
+        })
     }
 
     /// Where a point of the left camera frame is seen; `None` behind the camera.
@@ -229,13 +286,23 @@ impl RectifiedRig {
     pub fn projection_jacobian(&self, p_cam: &Point3<f64>) -> Matrix3<f64> {
         let iz = 1.0 / p_cam.z;
         let uv = Matrix2x3::new(
-            self.fx * iz, 0.0, -self.fx * p_cam.x * iz * iz,
-            0.0, self.fy * iz, -self.fy * p_cam.y * iz * iz,
+            self.fx * iz,
+            0.0,
+            -self.fx * p_cam.x * iz * iz,
+            0.0,
+            self.fy * iz,
+            -self.fy * p_cam.y * iz * iz,
         );
         Matrix3::new(
-            uv[(0, 0)], uv[(0, 1)], uv[(0, 2)],
-            uv[(1, 0)], uv[(1, 1)], uv[(1, 2)],
-            0.0, 0.0, -self.fx * self.baseline * iz * iz,
+            uv[(0, 0)],
+            uv[(0, 1)],
+            uv[(0, 2)],
+            uv[(1, 0)],
+            uv[(1, 1)],
+            uv[(1, 2)],
+            0.0,
+            0.0,
+            -self.fx * self.baseline * iz * iz,
         )
     }
 
@@ -244,15 +311,244 @@ impl RectifiedRig {
     ///
     /// `dz/dd = -z^2/(f b)`, `dx/dd = x/z dz/dd`, `dx/du = z/f`: first order, so honest while
     /// `sigma_d` is small against `d`.
-    pub fn point_covariance(&self, p_cam: &Point3<f64>, sigma_px: f64, sigma_d: f64) -> Matrix3<f64> {
+    pub fn point_covariance(
+        &self,
+        p_cam: &Point3<f64>,
+        sigma_px: f64,
+        sigma_d: f64,
+    ) -> Matrix3<f64> {
         let z = p_cam.z;
         let dz = -z * z / (self.fx * self.baseline);
         let jacobian = Matrix3::new(
-            z / self.fx, 0.0, p_cam.x / z * dz,
-            0.0, z / self.fy, p_cam.y / z * dz,
-            0.0, 0.0, dz,
+            z / self.fx,
+            0.0,
+            p_cam.x / z * dz,
+            0.0,
+            z / self.fy,
+            p_cam.y / z * dz,
+            0.0,
+            0.0,
+            dz,
         );
-        let noise = Matrix3::from_diagonal(&Vector3::new(sigma_px * sigma_px, sigma_px * sigma_px, sigma_d * sigma_d));
+        let noise = Matrix3::from_diagonal(&Vector3::new(
+            sigma_px * sigma_px,
+            sigma_px * sigma_px,
+            sigma_d * sigma_d,
+        ));
         jacobian * noise * jacobian.transpose()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Distortion;
+
+    fn rectified() -> RectifiedRig {
+        RectifiedRig {
+            width: 640,
+            height: 480,
+            fx: 500.0,
+            fy: 510.0,
+            cx: 321.5,
+            cy: 236.25,
+            doffs: 7.5,
+            baseline: 0.2,
+        }
+    }
+
+    fn points() -> Vec<Point3<f64>> {
+        vec![
+            Point3::new(0.4, -0.3, 2.5),
+            Point3::new(-3.0, 1.0, 12.0),
+            Point3::new(0.0, 0.0, 0.7),
+        ]
+    }
+
+    #[test]
+    fn back_projection_inverts_projection() {
+        for p_cam in points() {
+            let seen = rectified().project(&p_cam).unwrap();
+            let back = rectified().back_project(seen).unwrap();
+            assert!(
+                (back - p_cam).norm() < 1e-12 * p_cam.coords.norm(),
+                "{back}"
+            );
+        }
+        assert!(rectified().project(&Point3::new(0.0, 0.0, -1.0)).is_none());
+        for d in [-7.5, -20.0, f64::NAN] {
+            assert!(
+                rectified()
+                    .back_project(StereoPoint { u: 0.0, v: 0.0, d })
+                    .is_none(),
+                "{d}"
+            );
+        }
+    }
+
+    #[test]
+    fn disparity_is_the_left_column_less_the_right() {
+        let rig = Rig::from(rectified());
+        for p_cam in points() {
+            let seen = rectified().project(&p_cam).unwrap();
+            let left = rig.left.project(&p_cam).unwrap();
+            let right = rig.right.project(&(rig.T_right_left * p_cam)).unwrap();
+            assert!((left.x - right.x - seen.d).abs() < 1e-9 && (left.y - right.y).abs() < 1e-9);
+            assert!((left.x - seen.u).abs() < 1e-9 && (left.y - seen.v).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn projection_jacobian_is_the_derivative() {
+        let rig = rectified();
+        let uvd = |p: Point3<f64>| {
+            rig.project(&p)
+                .map(|s| Vector3::new(s.u, s.v, s.d))
+                .unwrap()
+        };
+        for p_cam in points() {
+            let jacobian = rig.projection_jacobian(&p_cam);
+            for axis in 0..3 {
+                let step = Vector3::ith(axis, 1e-6);
+                let numeric = (uvd(p_cam + step) - uvd(p_cam - step)) / 2e-6;
+                assert!(
+                    (jacobian.column(axis) - numeric).norm() < 1e-5 * jacobian.norm(),
+                    "{axis}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn covariance_is_the_derivative_of_back_projection_squared() {
+        let rig = rectified();
+        let (sigma_px, sigma_d) = (0.4, 0.7);
+        for p_cam in points() {
+            let at = rig.project(&p_cam).unwrap();
+            let moved = |axis: usize, by: f64| {
+                let by = Vector3::ith(axis, by);
+                rig.back_project(StereoPoint {
+                    u: at.u + by.x,
+                    v: at.v + by.y,
+                    d: at.d + by.z,
+                })
+                .unwrap()
+            };
+            let mut numeric = Matrix3::zeros();
+            for (axis, sigma) in [sigma_px, sigma_px, sigma_d].into_iter().enumerate() {
+                let column = (moved(axis, 1e-6) - moved(axis, -1e-6)) / 2e-6 * sigma;
+                numeric += column * column.transpose();
+            }
+            let covariance = rig.point_covariance(&p_cam, sigma_px, sigma_d);
+            assert!(
+                (covariance - numeric).norm() < 1e-6 * numeric.norm(),
+                "{covariance} {numeric}"
+            );
+        }
+    }
+
+    fn load(text: &str) -> Result<Rig, GeometryError> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("rig.toml");
+        std::fs::write(&path, text).unwrap();
+        Rig::load(&path)
+    }
+
+    #[test]
+    fn rig_toml_round_trips() {
+        let bent = |k| Camera {
+            distortion: k,
+            ..Camera::pinhole(400.5, 401.0, 300.0, 200.0)
+        };
+        let unrectified = Rig {
+            width: 600,
+            height: 400,
+            left: bent(Distortion::RadTan([-0.3, 0.1, 0.001, -0.002, 0.01])),
+            right: bent(Distortion::Equidistant([0.01, 0.02, 0.003, 0.004])),
+            T_right_left: Se3::new(
+                Vector3::new(-0.12, 0.003, 0.004),
+                Vector3::new(0.01, -0.02, 0.03),
+            ),
+            rectified: false,
+        };
+        for rig in [
+            unrectified,
+            Rig::from(rectified()),
+            Rig::from(RectifiedRig {
+                doffs: 0.0,
+                ..rectified()
+            }),
+        ] {
+            let back = load(&rig.to_toml()).unwrap();
+            assert_eq!(
+                (back.width, back.height, back.left, back.right),
+                (rig.width, rig.height, rig.left, rig.right)
+            );
+            let motion = crate::se3::log(&(back.T_right_left.inverse() * rig.T_right_left));
+            assert!(
+                motion.norm() < 1e-9 && back.rectified == rig.rectified,
+                "{motion}"
+            );
+        }
+    }
+
+    #[test]
+    fn errors_name_the_file_and_the_field() {
+        let camera = "[left]\nfx = 100.0\nfy = 100.0\ncx = 50.0\ncy = 40.0\n";
+        let size = "width = 100\nheight = 80\n";
+        let turned =
+            "[right_from_left]\nrotation = [[1,0,0],[0,2,0],[0,0,1]]\ntranslation = [-0.1,0,0]\n";
+        let swapped =
+            "[right_from_left]\nrotation = [[1,0,0],[0,1,0],[0,0,1]]\ntranslation = [0.1,0,0]\n";
+        let cases = [
+            (
+                format!("rectified = true\nbaseline = 0.0\n{size}{camera}"),
+                "baseline",
+            ),
+            (
+                format!("rectified = true\nbaseline = -0.1\n{size}{camera}"),
+                "baseline",
+            ),
+            (format!("rectified = true\n{size}{camera}"), "baseline"),
+            (
+                format!("rectified = true\nbaseline = 0.1\nfocal = 3\n{size}{camera}"),
+                "focal",
+            ),
+            (format!("rectified = true\nbaseline = 0.1\n{size}"), "left"),
+            (
+                format!("rectified = true\nbaseline = 0.1\nwidth = 0\nheight = 80\n{camera}"),
+                "width",
+            ),
+            (
+                format!(
+                    "rectified = true\nbaseline = 0.1\n{size}{}",
+                    camera.replace("fx = 100", "fx = -1")
+                ),
+                "focal length -1",
+            ),
+            (
+                format!("rectified = true\nbaseline = 0.1\n{size}{camera}model = \"fish\"\n"),
+                "fish",
+            ),
+            (
+                format!("rectified = false\n{size}{camera}{turned}"),
+                "rotation",
+            ),
+            (
+                format!("rectified = false\n{size}{camera}{swapped}"),
+                "translation",
+            ),
+        ];
+        for (text, field) in cases {
+            let message = load(&text).unwrap_err().to_string();
+            assert!(
+                message.contains("rig.toml") && message.contains(field),
+                "{field}: {message}"
+            );
+        }
+        let absent = Rig::load(Path::new("/absent/rig.toml"))
+            .unwrap_err()
+            .to_string();
+        assert!(absent.contains("/absent/rig.toml"), "{absent}");
     }
 }

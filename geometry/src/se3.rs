@@ -19,7 +19,10 @@ pub fn left_jacobian(phi: &Vector3<f64>) -> Matrix3<f64> {
         (0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0)
     } else {
         let angle = angle2.sqrt();
-        ((1.0 - angle.cos()) / angle2, (angle - angle.sin()) / (angle2 * angle))
+        (
+            (1.0 - angle.cos()) / angle2,
+            (angle - angle.sin()) / (angle2 * angle),
+        )
     };
     Matrix3::identity() + k * a + k * k * b
 }
@@ -54,7 +57,10 @@ mod tests {
         for scale in [1e-9, 1e-5, 1e-4, 1e-2, 0.5, 3.0] {
             let twist = Vector6::new(0.3, -0.2, 0.9, 0.4, -0.6, 0.5) * scale;
             let back = log(&exp(&twist));
-            assert!((back - twist).norm() <= 1e-12 * scale.max(1.0), "{scale}: {back} {twist}");
+            assert!(
+                (back - twist).norm() <= 1e-12 * scale.max(1.0),
+                "{scale}: {back} {twist}"
+            );
         }
     }
 

@@ -31,13 +31,17 @@ impl Trajectory {
         let mut poses = Vec::with_capacity(rows.len());
         for (line, r) in rows {
             let q = Quaternion::new(r[7], r[4], r[5], r[6]);
-            let rotation = UnitQuaternion::try_new(q, 1e-9).ok_or_else(|| GeometryError::Trajectory {
-                path: path.to_owned(),
-                line,
-                message: "the quaternion is zero".into(),
-            })?;
+            let rotation =
+                UnitQuaternion::try_new(q, 1e-9).ok_or_else(|| GeometryError::Trajectory {
+                    path: path.to_owned(),
+                    line,
+                    message: "the quaternion is zero".into(),
+                })?;
             let pose = Se3::from_parts(Translation3::new(r[1], r[2], r[3]), rotation);
-            poses.push(StampedPose { time: r[0], T_world_cam: pose });
+            poses.push(StampedPose {
+                time: r[0],
+                T_world_cam: pose,
+            });
         }
         Ok(Self { poses })
     }
@@ -63,9 +67,26 @@ impl Trajectory {
                     message: format!("no time for this pose: only {} times are known", t.len()),
                 })?,
             };
-            poses.push(StampedPose { time, T_world_cam: pose });
+            poses.push(StampedPose {
+                time,
+                T_world_cam: pose,
+            });
         }
         Ok(Self { poses })
+    }
+
+    /// The pose at a time, between its two neighbours: position linearly, rotation along the
+    /// shortest arc. `None` before the first pose, after the last, and between opposite rotations.
+    pub fn at(&self, time: f64) -> Option<Se3> {
+        let after = self.poses.partition_point(|p| p.time < time);
+        let next = self.poses.get(after)?;
+        if next.time == time {
+            return Some(next.T_world_cam);
+        }
+        let last = self.poses.get(after.checked_sub(1)?)?;
+        let share = (time - last.time) / (next.time - last.time);
+        last.T_world_cam
+            .try_lerp_slerp(&next.T_world_cam, share, 1e-9)
     }
 
     /// TUM text.
@@ -73,7 +94,10 @@ impl Trajectory {
         let line = |p: &StampedPose| {
             let t = p.T_world_cam.translation.vector;
             let q = p.T_world_cam.rotation.coords;
-            format!("{:.6} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}\n", p.time, t.x, t.y, t.z, q.x, q.y, q.z, q.w)
+            format!(
+                "{:.6} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}\n",
+                p.time, t.x, t.y, t.z, q.x, q.y, q.z, q.w
+            )
         };
         self.poses.iter().map(line).collect()
     }
@@ -82,7 +106,9 @@ impl Trajectory {
     pub fn to_kitti(&self) -> String {
         let line = |p: &StampedPose| {
             let m = p.T_world_cam.to_matrix();
-            let row: Vec<String> = (0..12).map(|i| format!("{:.9e}", m[(i / 4, i % 4)])).collect();
+            let row: Vec<String> = (0..12)
+                .map(|i| format!("{:.9e}", m[(i / 4, i % 4)]))
+                .collect();
             row.join(" ") + "\n"
         };
         self.poses.iter().map(line).collect()
@@ -90,7 +116,11 @@ impl Trajectory {
 }
 
 /// Lines of `columns` numbers each, with their line number; blank and `#` lines are passed over.
-fn read_rows(path: &Path, columns: usize, expected: &str) -> Result<Vec<(usize, Vec<f64>)>, GeometryError> {
+fn read_rows(
+    path: &Path,
+    columns: usize,
+    expected: &str,
+) -> Result<Vec<(usize, Vec<f64>)>, GeometryError> {
     let text = std::fs::read_to_string(path).map_err(GeometryError::io(path))?;
     let mut rows = Vec::new();
     for (i, line) in text.lines().enumerate() {
@@ -127,7 +157,10 @@ mod tests {
             .map(|i| {
                 let s = i as f64;
                 let twist = Vector6::new(s, -0.5 * s, 0.25, 0.1 * s, 0.3, -0.2 * s);
-                StampedPose { time: s, T_world_cam: se3::exp(&twist) }
+                StampedPose {
+                    time: s,
+                    T_world_cam: se3::exp(&twist),
+                }
             })
             .collect();
         Trajectory { poses }
@@ -149,6 +182,24 @@ mod tests {
         assert_same(&Trajectory::read_tum(&path).unwrap(), &sample());
         std::fs::write(&path, sample().to_kitti()).unwrap();
         assert_same(&Trajectory::read_kitti(&path, None).unwrap(), &sample());
+    }
+
+    #[test]
+    fn between_poses_the_motion_is_even_and_outside_it_is_unknown() {
+        let sample = sample();
+        for (i, pose) in sample.poses.iter().enumerate() {
+            assert_eq!(sample.at(i as f64), Some(pose.T_world_cam));
+        }
+        let (a, b) = (sample.poses[1].T_world_cam, sample.poses[2].T_world_cam);
+        let quarter = sample.at(1.25).unwrap();
+        let expected = a.translation.vector * 0.75 + b.translation.vector * 0.25;
+        assert!((quarter.translation.vector - expected).norm() < 1e-12);
+        assert!(
+            (a.rotation.angle_to(&quarter.rotation) - 0.25 * a.rotation.angle_to(&b.rotation))
+                .abs()
+                < 1e-9
+        );
+        assert!(sample.at(-0.1).is_none() && sample.at(4.1).is_none());
     }
 
     #[test]
