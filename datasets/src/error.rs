@@ -1,4 +1,4 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use barchan_geometry::GeometryError;
 
@@ -24,4 +24,19 @@ pub enum DataError {
     /// The rig or a trajectory of the dataset is wrong.
     #[error(transparent)]
     Geometry(#[from] GeometryError),
+}
+
+impl DataError {
+    /// Something is wrong with a file.
+    pub(crate) fn file(path: &Path, message: impl Into<String>) -> Self {
+        Self::File {
+            path: path.to_owned(),
+            message: message.into(),
+        }
+    }
+
+    /// The system refused a file.
+    pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |error| Self::file(path, error.to_string())
+    }
 }

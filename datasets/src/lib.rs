@@ -1,8 +1,8 @@
 //! Stereo sequences from disk or rendered: one file per format.
 //!
 //! What it is for: a [`StereoSource`] yields rectified [`StereoFrame`]s and, when it has it, truth.
-//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`rows`] measures whether the
-//! rows of a pair correspond at all; [`disparity_file`] reads and writes disparity images.
+//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`disparity_file`] reads and
+//! writes disparity images.
 //!
 //! What it promises: frames are lazy (memory does not grow with the length of a sequence), images
 //! are `f32` in 0..=1, and an error names the file and the cure.
@@ -12,14 +12,15 @@
 pub mod disparity_file;
 mod error;
 mod folder;
+mod image_file;
 mod open;
 mod prefetch;
-pub mod rows;
+mod resample;
 mod source;
-pub mod synth;
 
 pub use error::DataError;
 pub use folder::Folder;
-pub use open::open;
-pub use prefetch::prefetch;
+pub use image_file::read_rgb;
+pub use open::{FORMATS, open};
+pub use prefetch::{Prefetch, prefetch};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma};

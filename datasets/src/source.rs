@@ -61,7 +61,10 @@ pub trait StereoSource: Send + Sync {
 
 /// Luminance by the BT.601 weights.
 pub fn luma(image: &Rgb) -> Plane {
-    let data = image.as_raw().chunks_exact(3).map(|p| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2]);
+    let data = image
+        .as_raw()
+        .chunks_exact(3)
+        .map(|p| 0.299 * p[0] + 0.587 * p[1] + 0.114 * p[2]);
     let (width, height) = image.dimensions();
     // The buffer has one value a pixel by construction.
     Plane::from_raw(width, height, data.collect()).unwrap_or_default()
