@@ -1,1 +1,31 @@
-//! placeholder
+//! Terrain out of disparity: clouds, voxels, digital elevation models, shaded relief and their files.
+//!
+//! What it is for: [`map_keyframes`] turns key frames with disparity into a coloured voxel cloud, a
+//! DEM and a hillshade, as Hong 2021, 3.2.2 and 4.3 do; its parts ([`Cloud`], [`VoxelMap`],
+//! [`level()`], [`Raster`], [`hillshade()`], PLY and GeoTIFF files) serve alone as well.
+//!
+//! What it promises: metres; z up in everything levelled; rasters north-up, whose rows run south;
+//! NaN is "no data" in memory and -9999 in files; the same input gives the same output, bit by bit;
+//! memory bounded by the voxels, not by the length of a sequence; a file appears whole or not at all.
+//!
+//! What it never does: estimate poses or disparity, fill holes, or invent a coordinate system.
+
+mod atomic;
+mod cloud;
+mod error;
+mod geotiff;
+mod hillshade;
+mod level;
+mod map;
+mod ply;
+mod raster;
+mod voxel;
+
+pub use cloud::{Cloud, CloudPoint, DepthLimits};
+pub use error::TerrainError;
+pub use geotiff::{Crs, Sample, write_geotiff};
+pub use hillshade::{Light, hillshade};
+pub use level::{Levelled, level};
+pub use map::{DenseKeyframe, Levelling, MapConfig, TerrainMap, map_keyframes};
+pub use raster::{CellStatistic, Dem, Grid, NODATA, Raster, dem};
+pub use voxel::{Voxel, VoxelMap};
