@@ -282,7 +282,7 @@ mod tests {
                 (40..=42).contains(&raster.grid.width) && (40..=42).contains(&raster.grid.height)
             );
             let known = raster.values.iter().filter(|v| v.is_finite()).count();
-            assert!(known >= 36 * 36 && known <= 41 * 41, "{known}");
+            assert!((36 * 36..=41 * 41).contains(&known), "{known}");
         }
         let one = dem(&[voxel(0.0, 0.0, 3.0, 1)], 1.0, CellStatistic::Mean, 10)
             .unwrap()
