@@ -1,2 +1,74 @@
-//! placeholder
-fn main() {}
+//! The command line of Barchan: from unlabelled rover stereo to metric terrain.
+//!
+//! One module per subcommand under [`commands`], each an `Args` struct and a `run`. No algorithm
+//! lives here: a command opens its inputs, calls the crates, and writes what they return.
+
+mod commands;
+mod data;
+mod engine;
+mod output;
+mod preview;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// From unlabelled rover stereo to metric terrain.
+#[derive(Parser)]
+#[command(
+    name = "barchan",
+    version,
+    propagate_version = true,
+    after_help = "A first run, with nothing but this program:\n  \
+        barchan data synth synth:seed=1,frames=40 --out data\n  \
+        barchan slam --data data --model tiny --out run\n  \
+        barchan map run --out map"
+)]
+struct Cli {
+    /// Print machine-readable JSON on standard output instead of tables.
+    #[arg(long, global = true)]
+    json: bool,
+    /// Where libonnxruntime.so is; by default $BARCHAN_ONNXRUNTIME, then what `make onnxruntime` installed.
+    #[arg(long, global = true, value_name = "PATH")]
+    onnxruntime: Option<std::path::PathBuf>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Train(commands::train::Args),
+    Export(commands::export::Args),
+    Infer(commands::infer::Args),
+    Slam(commands::slam::Args),
+    Map(commands::map::Args),
+    Raster(commands::raster::Args),
+    Eval(commands::eval::Args),
+    Data(commands::data::Args),
+    Doctor(commands::doctor::Args),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let output = output::Output { json: cli.json };
+    let runtime = cli.onnxruntime.as_deref();
+    let result = match cli.command {
+        Command::Train(args) => commands::train::run(args, &output),
+        Command::Export(args) => commands::export::run(args, &output),
+        Command::Infer(args) => commands::infer::run(args, &output, runtime),
+        Command::Slam(args) => commands::slam::run(args, &output, runtime),
+        Command::Map(args) => commands::map::run(args, &output),
+        Command::Raster(args) => commands::raster::run(args, &output),
+        Command::Eval(args) => commands::eval::run(args, &output),
+        Command::Data(args) => commands::data::run(args, &output),
+        Command::Doctor(args) => commands::doctor::run(args, &output, runtime),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // Nobody is left to tell when standard error is gone too.
+            eprintln!("error: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}

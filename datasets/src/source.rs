@@ -37,6 +37,11 @@ pub trait StereoSource: Send + Sync {
         self.len() == 0
     }
 
+    /// The name of frame `index` without reading it, as in [`StereoFrame::name`].
+    fn name(&self, index: usize) -> String {
+        format!("{index:06}")
+    }
+
     /// Reads (or renders) frame `index`.
     ///
     /// # Errors
@@ -68,4 +73,18 @@ pub fn luma(image: &Rgb) -> Plane {
     let (width, height) = image.dimensions();
     // The buffer has one value a pixel by construction.
     Plane::from_raw(width, height, data.collect()).unwrap_or_default()
+}
+
+/// A crop of an image as red, green and blue planes one after another: how networks want it. The
+/// crop must lie inside the image.
+pub fn planar(image: &Rgb, [x0, y0]: [usize; 2], [width, height]: [usize; 2]) -> Vec<f32> {
+    let (row, data) = (image.width() as usize, image.as_raw());
+    let mut planes = Vec::with_capacity(3 * width * height);
+    for channel in 0..3 {
+        for y in y0..y0 + height {
+            let start = 3 * (y * row + x0) + channel;
+            planes.extend(data[start..].iter().step_by(3).take(width));
+        }
+    }
+    planes
 }

@@ -31,11 +31,43 @@ pub trait DisparityEngine: Send {
     fn disparity(&mut self, left: &Rgb, right: &Rgb) -> Result<DisparityMap, InferError>;
 }
 
+impl DisparityMap {
+    /// From the three outputs of a network, each one value a pixel, row by row.
+    #[cfg(any(feature = "burn", feature = "onnxruntime"))]
+    pub(crate) fn from_network(
+        engine: &str,
+        (width, height): (u32, u32),
+        outputs: [Vec<f32>; 3],
+    ) -> Result<Self, InferError> {
+        let plane = |data: Vec<f32>| {
+            let found = data.len();
+            Plane::from_raw(width, height, data).filter(|_| found == (width * height) as usize).ok_or_else(|| {
+                InferError::Failed {
+                    engine: engine.into(),
+                    message: format!("an output of {found} values for an image of {width} x {height}"),
+                }
+            })
+        };
+        let [disparity, sigma, confidence] = outputs;
+        Ok(Self { disparity: plane(disparity)?, sigma: plane(sigma)?, confidence: plane(confidence)? })
+    }
+}
+
+/// Refuses a pair of two sizes, and an empty one.
+#[cfg(any(feature = "burn", feature = "onnxruntime"))]
+pub(crate) fn check_sizes(left: &Rgb, right: &Rgb) -> Result<(), InferError> {
+    let (left, right) = (left.dimensions(), right.dimensions());
+    if left != right || left.0 == 0 || left.1 == 0 {
+        return Err(InferError::Sizes { left, right });
+    }
+    Ok(())
+}
+
 /// Why there is no disparity.
 #[derive(Debug, thiserror::Error)]
 pub enum InferError {
     /// The two images of a pair have different sizes.
-    #[error("the left image is {left:?} and the right {right:?}: a pair has one size")]
+    #[error("the left image is {0} x {1} and the right {2} x {3}: a pair has one size, at least 1 x 1", left.0, left.1, right.0, right.1)]
     Sizes {
         /// Width and height of the left image.
         left: (u32, u32),

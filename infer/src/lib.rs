@@ -8,8 +8,16 @@
 //!
 //! What it never does: train, or know where images come from.
 
+#[cfg(feature = "burn")]
+mod burn_engine;
 mod engine;
+#[cfg(feature = "onnxruntime")]
+mod onnxruntime;
 mod rejection;
 
+#[cfg(feature = "burn")]
+pub use burn_engine::BurnEngine;
 pub use engine::{DisparityEngine, DisparityMap, InferError};
+#[cfg(feature = "onnxruntime")]
+pub use onnxruntime::{OnnxEngine, Runtime};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};

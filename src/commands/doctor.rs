@@ -1,0 +1,50 @@
+use std::path::Path;
+
+use anyhow::Result;
+use barchan_infer::{DisparityEngine, Runtime};
+use barchan_train::DeviceName;
+use clap::Parser;
+use serde::Serialize;
+
+use crate::engine::load_engine;
+use crate::output::Output;
+
+/// Say what is installed, what works, and how to get the rest
+#[derive(Parser)]
+pub struct Args {}
+
+#[derive(Serialize)]
+struct Check {
+    name: &'static str,
+    works: bool,
+    detail: String,
+}
+
+pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
+    let check = |name, result: Result<String>| Check {
+        name,
+        works: result.is_ok(),
+        detail: result.unwrap_or_else(|e| format!("{e:#}")),
+    };
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let checks = [
+        check("processor", Ok(format!("{cores} cores"))),
+        check("shipped weights with Burn", try_shipped()),
+        check("train --device flex", Ok(format!("{:?}", DeviceName::Flex.device()))),
+        check("train --device ndarray", Ok(format!("{:?}", DeviceName::Ndarray.device()))),
+        check("ONNX Runtime", Runtime::load(runtime).map(|r| r.path().display().to_string()).map_err(Into::into)),
+    ];
+    let text: String = checks
+        .iter()
+        .map(|c| format!("{:<26} {:<4} {}\n", c.name, if c.works { "ok" } else { "no" }, c.detail))
+        .collect();
+    output.result(&checks, &text)
+}
+
+/// Runs the shipped network on a small grey pair.
+fn try_shipped() -> Result<String> {
+    let mut engine: Box<dyn DisparityEngine> = load_engine("tiny", None, 0)?;
+    let grey = barchan_datasets::Rgb::from_pixel(64, 48, image::Rgb([0.5; 3]));
+    engine.disparity(&grey, &grey)?;
+    Ok("tiny".into())
+}

@@ -1,0 +1,11 @@
+//! One module per subcommand.
+
+pub mod data;
+pub mod doctor;
+pub mod eval;
+pub mod export;
+pub mod infer;
+pub mod map;
+pub mod raster;
+pub mod slam;
+pub mod train;

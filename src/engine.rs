@@ -1,0 +1,45 @@
+//! `MODEL`: a file or a shipped name becomes a disparity engine.
+
+use std::path::Path;
+
+use anyhow::{Context, Result, bail};
+use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Runtime};
+use barchan_model::{Device, StereoNet, weights};
+use barchan_train::RunDir;
+
+/// Weights that are part of this program.
+const SHIPPED: [(&str, &[u8]); 1] = [("tiny", include_bytes!("../checkpoints/tiny.safetensors"))];
+
+/// The network of a shipped name, a safetensors file, or a run directory of `barchan train`.
+pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
+    if let Some((name, bytes)) = SHIPPED.iter().find(|(name, _)| *name == model) {
+        return Ok(weights::from_bytes(bytes, Path::new(name), device)?);
+    }
+    let path = RunDir::weights_of(Path::new(model));
+    if path.extension().is_some_and(|e| e == "onnx") {
+        bail!("{model}: an ONNX file cannot be trained or exported again\n  cure: give the run directory or the .safetensors it came from");
+    }
+    if !path.is_file() {
+        bail!("{}: no such weights\n  cure: give a run of `barchan train`, a .safetensors file, or one of: {}", path.display(), names());
+    }
+    Ok(weights::load(&path, device)?)
+}
+
+/// The engine for a model: ONNX Runtime for `x.onnx`, Burn for weights and shipped names.
+pub fn load_engine(model: &str, runtime: Option<&Path>, threads: usize) -> Result<Box<dyn DisparityEngine>> {
+    let path = Path::new(model);
+    if path.extension().is_some_and(|e| e == "onnx") {
+        // A missing file is the more likely mistake, and the cheaper to find.
+        std::fs::metadata(path).with_context(|| format!("{model}: no such model"))?;
+        let runtime = Runtime::load(runtime)?;
+        return Ok(Box::new(OnnxEngine::load(&runtime, path, threads)?));
+    }
+    let device = Device::flex();
+    let net = load_net(model, &device)?;
+    Ok(Box::new(BurnEngine::new(net, device, model)))
+}
+
+/// Shipped names, for messages.
+pub fn names() -> String {
+    SHIPPED.map(|(name, _)| name).join(", ")
+}

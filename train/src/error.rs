@@ -1,0 +1,36 @@
+use std::path::PathBuf;
+
+use barchan_datasets::DataError;
+use barchan_model::ModelError;
+
+/// Why training cannot start or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// The data cannot be read.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The network cannot be made, read or written.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A file of the run directory.
+    #[error("{path}: {message}")]
+    Run {
+        /// The file or directory.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        message: String,
+    },
+    /// The configuration asks for what cannot be.
+    #[error("{0}")]
+    Config(String),
+    /// The loss is no longer a number.
+    #[error("step {step}: the loss is {loss} on {frames}\n  cure: resume from the last checkpoint with a lower --lr, and look at these frames")]
+    NotFinite {
+        /// The step, from 1.
+        step: usize,
+        /// Its loss.
+        loss: f32,
+        /// The frames of the batch.
+        frames: String,
+    },
+}
