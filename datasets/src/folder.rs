@@ -117,6 +117,12 @@ impl StereoSource for Folder {
         self.pairs.len()
     }
 
+    fn name(&self, index: usize) -> String {
+        self.pairs
+            .get(index)
+            .map_or_else(String::new, |pair| pair.name.clone())
+    }
+
     fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
         let pair = self
             .pairs

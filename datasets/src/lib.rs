@@ -1,8 +1,9 @@
 //! Stereo sequences from disk or rendered: one file per format.
 //!
 //! What it is for: a [`StereoSource`] yields rectified [`StereoFrame`]s and, when it has it, truth.
-//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`disparity_file`] reads and
-//! writes disparity images.
+//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`rows`] measures whether the
+//! rows of a pair correspond at all; [`disparity_file`] reads and writes disparity images;
+//! [`write_folder`] writes any source as images on disk.
 //!
 //! What it promises: frames are lazy (memory does not grow with the length of a sequence), images
 //! are `f32` in 0..=1, and an error names the file and the cure.
@@ -16,11 +17,16 @@ mod image_file;
 mod open;
 mod prefetch;
 mod resample;
+pub mod rows;
 mod source;
+pub mod synth;
+mod write_folder;
 
 pub use error::DataError;
 pub use folder::Folder;
 pub use image_file::read_rgb;
 pub use open::{FORMATS, open};
 pub use prefetch::{Prefetch, prefetch};
-pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma};
+pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
+pub use synth::{Synth, SynthOptions};
+pub use write_folder::write_folder;

@@ -1,9 +1,9 @@
 use std::path::Path;
 
-use crate::{DataError, Folder, StereoSource};
+use crate::{DataError, Folder, StereoSource, Synth};
 
 /// What [`open`] understands, for help texts.
-pub const FORMATS: &[&str] = &["folder:PATH"];
+pub const FORMATS: &[&str] = &["folder:PATH", "synth:seed=1,frames=60"];
 
 /// Opens a dataset: `FORMAT:PATH`, or a plain path whose format is found out.
 ///
@@ -13,10 +13,13 @@ pub const FORMATS: &[&str] = &["folder:PATH"];
 pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
     let path = Path::new(spec);
     if !path.exists()
-        && let Some((format, rest)) = spec.split_once(':')
+        && let Some((format, rest)) = spec
+            .split_once(':')
+            .or((spec == "synth").then_some((spec, "")))
     {
         return match format {
             "folder" => Ok(Box::new(Folder::open(Path::new(rest))?)),
+            "synth" => Ok(Box::new(Synth::parse(rest)?)),
             _ => Err(layout(
                 spec,
                 &format!("unknown format \"{format}\"; known: {}", FORMATS.join(", ")),
