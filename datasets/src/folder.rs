@@ -451,3 +451,288 @@ fn number(path: &Path, line: usize, text: &str) -> Result<f64, DataError> {
         .filter(|v: &f64| v.is_finite())
         .ok_or_else(|| DataError::file(path, message()))
 }
+
+#[cfg(test)]
+#[allow(non_snake_case)]
+mod tests {
+    use super::*;
+    use barchan_geometry::nalgebra::{Point3, Vector3};
+    use barchan_geometry::{Camera, Distortion, se3};
+
+    const RIG: &str = "rectified = true\nwidth = 8\nheight = 6\nbaseline = 0.1\n[left]\nfx = 9.0\nfy = 9.0\ncx = 4.0\ncy = 3.0\n";
+
+    /// A dataset of 8 x 6 images of the given stems.
+    fn dataset(left: &[&str], right: &[&str]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("rig.toml"), RIG).unwrap();
+        for (side, stems) in [("left", left), ("right", right)] {
+            std::fs::create_dir(dir.path().join(side)).unwrap();
+            for (k, stem) in stems.iter().enumerate() {
+                let path = dir.path().join(side).join(format!("{stem}.png"));
+                image::GrayImage::from_pixel(8, 6, image::Luma([k as u8 + 1]))
+                    .save(path)
+                    .unwrap();
+            }
+        }
+        dir
+    }
+
+    fn error(dir: &Path) -> String {
+        Folder::open(dir)
+            .err()
+            .map(|e| e.to_string())
+            .unwrap_or_default()
+    }
+
+    /// The grey level of the right image of each frame: which file it came from.
+    fn rights(folder: &Folder) -> Vec<u8> {
+        let level = |i| (folder.frame(i).unwrap().right[(0, 0)].0[0] * 255.0).round() as u8;
+        (0..folder.len()).map(level).collect()
+    }
+
+    #[test]
+    fn images_pair_by_stem_or_else_by_natural_order() {
+        let dir = dataset(&["img10", "img2"], &["img2", "img10"]);
+        let folder = Folder::open(dir.path()).unwrap();
+        assert_eq!(
+            (folder.name(0), folder.name(1)),
+            ("img2".into(), "img10".into())
+        );
+        assert_eq!(
+            (rights(&folder), folder.frame(1).unwrap().time),
+            (vec![1, 2], 1.0)
+        );
+        let dir = dataset(&["l9", "l10", "l011"], &["r7", "r8", "r30"]);
+        assert_eq!(rights(&Folder::open(dir.path()).unwrap()), [1, 2, 3]);
+    }
+
+    #[test]
+    fn a_missing_or_doubled_image_is_named() {
+        let dir = dataset(&["a", "b", "c"], &["a", "c"]);
+        let message = error(dir.path());
+        assert!(message.contains("right/b.png: missing"), "{message}");
+        let dir = dataset(&["a", "c"], &["a", "b", "c"]);
+        let message = error(dir.path());
+        assert!(message.contains("left/b.png: missing"), "{message}");
+        let dir = dataset(&["a", "b"], &["x", "y", "z"]);
+        let message = error(dir.path());
+        assert!(
+            message.contains("3 images here and 2 in left/"),
+            "{message}"
+        );
+        let dir = dataset(&["a"], &["a"]);
+        std::fs::copy(dir.path().join("left/a.png"), dir.path().join("left/a.tif")).unwrap();
+        assert!(error(dir.path()).contains("same stem"));
+    }
+
+    #[test]
+    fn missing_and_empty_folders_and_a_missing_rig_are_named() {
+        assert!(error(Path::new("/no/such/place")).contains("/no/such/place: no such folder"));
+        let dir = dataset(&["a"], &[]);
+        assert!(error(dir.path()).contains("holds no image"));
+        std::fs::remove_dir(dir.path().join("right")).unwrap();
+        let message = error(dir.path());
+        assert!(message.contains("right: no such folder"), "{message}");
+        std::fs::remove_file(dir.path().join("rig.toml")).unwrap();
+        assert!(error(dir.path()).contains("rig.toml: missing"));
+    }
+
+    #[test]
+    fn another_size_and_a_damaged_image_are_named_with_the_frame_that_reads_them() {
+        let dir = dataset(&["a", "b", "c"], &["a", "b", "c"]);
+        let (wrong, cut) = (
+            dir.path().join("right/b.png"),
+            dir.path().join("left/c.png"),
+        );
+        image::GrayImage::new(9, 6).save(&wrong).unwrap();
+        let bytes = std::fs::read(&cut).unwrap();
+        std::fs::write(&cut, &bytes[..bytes.len() - 20]).unwrap();
+        let folder = Folder::open(dir.path()).unwrap();
+        assert!(folder.frame(0).is_ok());
+        let message = folder.frame(1).unwrap_err().to_string();
+        assert!(
+            message.contains("right/b.png")
+                && message.contains("9 x 6")
+                && message.contains("8 x 6"),
+            "{message}"
+        );
+        let message = folder.frame(2).unwrap_err().to_string();
+        assert!(message.contains("left/c.png"), "{message}");
+        assert!(folder.frame(3).is_err());
+    }
+
+    #[test]
+    fn times_and_each_kind_of_truth_are_read() {
+        let dir = dataset(&["a", "b"], &["a", "b"]);
+        let write = |name: &str, text: &str| std::fs::write(dir.path().join(name), text).unwrap();
+        assert!(
+            Folder::open(dir.path())
+                .unwrap()
+                .true_trajectory()
+                .is_none()
+        );
+
+        write("gt.csv", "time,x,y,dx\n5.0,1,2,0\n6.5,3,4,0\n");
+        let folder = Folder::open(dir.path()).unwrap();
+        let pose = |folder: &Folder, i: usize| folder.true_trajectory().unwrap().poses[i];
+        assert_eq!(folder.frame(1).unwrap().time, 6.5);
+        assert_eq!(
+            pose(&folder, 1),
+            StampedPose {
+                time: 6.5,
+                T_world_cam: Se3::translation(3.0, 4.0, 0.0)
+            }
+        );
+
+        // Denser truth is met at the times of the frames.
+        write("times.txt", "10\n11.5\n");
+        write(
+            "groundtruth.tum",
+            "9 0 0 0 0 0 0 1\n11 2 0 0 0 0 0 1\n12 4 0 0 0 0 0 1\n",
+        );
+        let folder = Folder::open(dir.path()).unwrap();
+        assert!((pose(&folder, 0).T_world_cam.translation.x - 1.0).abs() < 1e-12);
+        assert!((pose(&folder, 1).T_world_cam.translation.x - 3.0).abs() < 1e-12);
+        assert_eq!(pose(&folder, 1).time, 11.5);
+
+        write(
+            "poses.txt",
+            "1 0 0 7 0 1 0 8 0 0 1 9\n1 0 0 7 0 1 0 8 0 0 1 10\n",
+        );
+        let folder = Folder::open(dir.path()).unwrap();
+        assert_eq!(
+            pose(&folder, 1).T_world_cam,
+            Se3::translation(7.0, 8.0, 10.0)
+        );
+
+        for (name, text, expected) in [
+            (
+                "poses.txt",
+                "1 0 0 7 0 1 0 8 0 0 1 9\n",
+                "1 poses, but there are 2",
+            ),
+            ("times.txt", "10\nx\n", "line 2"),
+            ("times.txt", "10\n", "1 times, but there are 2"),
+        ] {
+            let before = std::fs::read_to_string(dir.path().join(name)).unwrap();
+            write(name, text);
+            let message = error(dir.path());
+            assert!(
+                message.contains(name) && message.contains(expected),
+                "{message}"
+            );
+            write(name, &before);
+        }
+    }
+
+    #[test]
+    fn gt_csv_without_its_columns_or_rows_is_an_error() {
+        let dir = dataset(&["a", "b"], &["a", "b"]);
+        for (text, expected) in [
+            ("time,x\n1,2\n", "no column \"y\""),
+            ("time,x,y\n1,2\n", "line 2"),
+            ("time,x,y\n1,2,3\n", "1 rows"),
+            ("", "no column"),
+        ] {
+            std::fs::write(dir.path().join("gt.csv"), text).unwrap();
+            let message = error(dir.path());
+            assert!(
+                message.contains("gt.csv") && message.contains(expected),
+                "{message}"
+            );
+        }
+    }
+
+    #[test]
+    fn disparity_is_found_by_stem_and_its_size_checked() {
+        let dir = dataset(&["a", "b"], &["a", "b"]);
+        let disparity = dir.path().join("disparity");
+        std::fs::create_dir(&disparity).unwrap();
+        let plane = Plane::from_pixel(8, 6, image::Luma([1.5]));
+        disparity_file::write_pfm(&disparity.join("b.pfm"), &plane).unwrap();
+        let folder = Folder::open(dir.path()).unwrap();
+        assert!(folder.true_disparity(0).unwrap().is_none());
+        assert_eq!(folder.true_disparity(1).unwrap(), Some(plane));
+        disparity_file::write_pfm(&disparity.join("b.pfm"), &Plane::new(4, 4)).unwrap();
+        assert!(
+            folder
+                .true_disparity(1)
+                .unwrap_err()
+                .to_string()
+                .contains("4 x 4")
+        );
+    }
+
+    /// What a camera at a pose sees of a wavy wall: the scene of the test below.
+    fn photograph(rig: &Rig, camera: &Camera, T_cam_left: &Se3) -> image::GrayImage {
+        image::GrayImage::from_fn(rig.width as u32, rig.height as u32, |u, v| {
+            let ray = camera
+                .ray(Vector3::new(f64::from(u), f64::from(v), 0.0).xy())
+                .push(1.0);
+            let T_left_cam = T_cam_left.inverse();
+            let (origin, ray) = (T_left_cam * Point3::origin(), T_left_cam.rotation * ray);
+            let p_left = origin + ray * ((4.0 - origin.z) / ray.z);
+            let grey = 0.5
+                + 0.2 * (3.1 * p_left.x + p_left.y).sin()
+                + 0.2 * (4.3 * p_left.y - p_left.x).cos();
+            image::Luma([(grey * 255.0).round() as u8])
+        })
+    }
+
+    #[test]
+    fn an_unrectified_rig_is_rectified_on_reading_and_its_truth_turned() {
+        let lens = |k| Distortion::RadTan([k, 0.05, 0.001, -0.002, 0.0]);
+        let turn = Vector3::new(0.02, -0.03, 0.025);
+        let rig = Rig {
+            width: 160,
+            height: 120,
+            left: Camera {
+                distortion: lens(-0.2),
+                ..Camera::pinhole(130.0, 131.0, 78.0, 61.0)
+            },
+            right: Camera {
+                distortion: lens(-0.15),
+                ..Camera::pinhole(128.0, 128.0, 81.0, 58.0)
+            },
+            T_right_left: Se3::new(Vector3::new(-0.3, 0.01, 0.02), turn),
+            rectified: false,
+        };
+        let dir = tempfile::tempdir().unwrap();
+        for (side, camera, pose) in [
+            ("left", &rig.left, &Se3::identity()),
+            ("right", &rig.right, &rig.T_right_left),
+        ] {
+            std::fs::create_dir(dir.path().join(side)).unwrap();
+            photograph(&rig, camera, pose)
+                .save(dir.path().join(side).join("0.png"))
+                .unwrap();
+        }
+        std::fs::write(dir.path().join("rig.toml"), rig.to_toml()).unwrap();
+        std::fs::write(dir.path().join("poses.txt"), "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        let folder = Folder::open(dir.path()).unwrap();
+        let frame = folder.frame(0).unwrap();
+
+        // The true pose now belongs to the rectified camera: a point on the wall, found through it
+        // at a pixel of the left image, has its right pixel on the same row.
+        let T_world_cam = folder.true_trajectory().unwrap().poses[0].T_world_cam;
+        assert!(se3::log(&T_world_cam).norm() > 0.005);
+        let (mut worst, mut checked) = (0.0f32, 0);
+        for (u, v) in (30..110).flat_map(|v| (45..140).map(move |u| (u as u32, v as u32))) {
+            let r = folder.rig();
+            let ray = T_world_cam.rotation
+                * Vector3::new(
+                    (f64::from(u) - r.cx) / r.fx,
+                    (f64::from(v) - r.cy) / r.fy,
+                    1.0,
+                );
+            let p_world = T_world_cam * Point3::origin() + ray * (4.0 / ray.z);
+            let seen = r.project(&(T_world_cam.inverse() * p_world)).unwrap();
+            let at = seen.u - seen.d;
+            let (x, a) = (at as u32, at.fract() as f32);
+            let right = (1.0 - a) * frame.right[(x, v)].0[0] + a * frame.right[(x + 1, v)].0[0];
+            worst = worst.max((right - frame.left[(u, v)].0[0]).abs());
+            checked += 1;
+        }
+        assert!(checked > 7000 && worst < 3.0 / 255.0, "{worst}");
+    }
+}

@@ -122,7 +122,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         for extension in ["png", "jpg", "tif", "ppm"] {
             let path = dir.path().join(format!("cut.{extension}"));
-            RgbImage::from_fn(120, 80, |x, y| Pixel([(x * 31 ^ y * 17) as u8; 3]))
+            RgbImage::from_fn(120, 80, |x, y| Pixel([((x * 31) ^ (y * 17)) as u8; 3]))
                 .save(&path)
                 .unwrap();
             let whole = std::fs::read(&path).unwrap();

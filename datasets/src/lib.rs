@@ -28,5 +28,5 @@ pub use image_file::read_rgb;
 pub use open::{FORMATS, open};
 pub use prefetch::{Prefetch, prefetch};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
-pub use synth::{Synth, SynthOptions};
+pub use synth::Synth;
 pub use write_folder::write_folder;

@@ -1,6 +1,7 @@
 //! Whether the rows of a pair correspond. A stereo network trained on pairs whose rows do not
 //! learns nothing, and says nothing about it: measure first.
 
+use nalgebra::{Matrix2, Vector2};
 use rayon::prelude::*;
 
 use crate::resample::cubic_weights;
@@ -173,18 +174,73 @@ fn row_offset_of(left: &Plane, right: &Plane, (x, y): (i32, i32)) -> Option<f64>
     if second > score(d, dy) - LEAD {
         return None;
     }
-    // The top of the paraboloid through the peak and its neighbours; both directions together,
-    // because slanted texture couples them.
-    let s = |i: i32, j: i32| f64::from(score(d + i, dy + j));
-    let (gx, gy) = ((s(1, 0) - s(-1, 0)) / 2.0, (s(0, 1) - s(0, -1)) / 2.0);
-    let (xx, yy) = (
-        s(1, 0) + s(-1, 0) - 2.0 * s(0, 0),
-        s(0, 1) + s(0, -1) - 2.0 * s(0, 0),
-    );
-    let xy = (s(1, 1) + s(-1, -1) - s(1, -1) - s(-1, 1)) / 4.0;
-    let determinant = xx * yy - xy * xy;
-    let step = (xy * gx - xx * gy) / determinant;
-    (determinant > 0.0 && step.abs() <= 1.0).then_some(f64::from(dy) + step)
+    refine(left, right, (x, y), &patch, norm, (d, dy))
+}
+
+/// The row offset of a match to a fraction of a pixel: least squares over the shift of the patch
+/// (Lucas and Kanade 1981, with the gradients of the left image), brightness and contrast free.
+/// A parabola through the correlations is drawn towards whole pixels by up to 0.1 px.
+fn refine(
+    left: &Plane,
+    right: &Plane,
+    (x, y): (i32, i32),
+    patch: &[f32],
+    norm: f32,
+    (d, dy): (i32, i32),
+) -> Option<f64> {
+    let at = |x: i32, y: i32| left[(x as u32, y as u32)].0[0];
+    let places: Vec<(i32, i32)> = (-RADIUS..=RADIUS)
+        .flat_map(|j| (-RADIUS..=RADIUS).map(move |i| (i, j)))
+        .collect();
+    let gradients: Vec<Vector2<f32>> = places
+        .iter()
+        .map(|(i, j)| {
+            let (x, y) = (x + i, y + j);
+            Vector2::new(at(x + 1, y) - at(x - 1, y), at(x, y + 1) - at(x, y - 1)) / (2.0 * norm)
+        })
+        .collect();
+    let normal: Matrix2<f32> = gradients.iter().map(|g| g * g.transpose()).sum();
+    let inverse = normal.try_inverse()?;
+    let mut shift = Vector2::zeros();
+    for _ in 0..8 {
+        let corner = Vector2::new((x - d) as f32, (y + dy) as f32) + shift;
+        let mut seen: Vec<f32> = places
+            .iter()
+            .map(|(i, j)| sample(right, corner.x + *i as f32, corner.y + *j as f32))
+            .collect();
+        let mean = seen.iter().sum::<f32>() / seen.len() as f32;
+        seen.iter_mut().for_each(|v| *v -= mean);
+        let seen_norm = seen.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-9);
+        let terms = gradients.iter().zip(seen.iter().zip(patch));
+        let step = inverse
+            * terms
+                .map(|(g, (r, l))| g * (r / seen_norm - l / norm))
+                .sum::<Vector2<f32>>();
+        shift -= step;
+        // More than the next pixel: not the peak that was found.
+        if shift.amax() > 1.0 || shift.x.is_nan() {
+            return None;
+        }
+        if step.amax() < 1e-3 {
+            break;
+        }
+    }
+    Some(f64::from(dy) + f64::from(shift.y))
+}
+
+/// The image between pixels, by cubic interpolation; beyond the border its last pixels.
+fn sample(image: &Plane, x: f32, y: f32) -> f32 {
+    let (w, h) = (image.width() as i32, image.height() as i32);
+    let (x0, y0) = (x.floor(), y.floor());
+    let (wx, wy) = (cubic_weights(x - x0), cubic_weights(y - y0));
+    let mut sum = 0.0;
+    for (j, wy) in (-1..3).zip(wy) {
+        let row = (y0 as i32 + j).clamp(0, h - 1) * w;
+        for (i, wx) in (-1..3).zip(wx) {
+            sum += wx * wy * image.as_raw()[(row + (x0 as i32 + i).clamp(0, w - 1)) as usize];
+        }
+    }
+    sum
 }
 
 /// A source whose right images are moved up by a row offset, so that rows correspond.
@@ -261,4 +317,149 @@ fn move_up(image: &Rgb, offset: f64) -> Rgb {
         });
     // The same size as before.
     Rgb::from_raw(width, height, out).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Synth, open};
+    use std::path::{Path, PathBuf};
+
+    fn traverse() -> Box<dyn StereoSource> {
+        Box::new(Synth::parse("seed=3,frames=2,width=256,height=192").unwrap())
+    }
+
+    #[test]
+    fn a_known_offset_is_measured_and_its_correction_leaves_none() {
+        let none = measure_row_offset(&*traverse()).unwrap();
+        assert!(
+            none.offset.abs() < 0.03 && none.spread < 0.2 && none.matches > 100,
+            "{none:?}"
+        );
+        assert!(!needs_correction(&none));
+        for offset in [2.3, -4.6, 0.75] {
+            let off = RowCorrected::new(traverse(), -offset);
+            let measured = measure_row_offset(&off).unwrap();
+            assert!(
+                (measured.offset - offset).abs() < 0.06,
+                "{offset}: {measured:?}"
+            );
+            assert!(needs_correction(&measured));
+            let corrected = RowCorrected::new(Box::new(off), measured.offset);
+            let left_over = measure_row_offset(&corrected).unwrap();
+            assert!(
+                left_over.offset.abs() < 0.06 && !needs_correction(&left_over),
+                "{left_over:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn correction_forwards_everything_else() {
+        let corrected = RowCorrected::new(traverse(), 1.5);
+        let source = traverse();
+        assert_eq!(
+            (corrected.len(), corrected.rig()),
+            (source.len(), source.rig())
+        );
+        assert_eq!(corrected.true_trajectory(), source.true_trajectory());
+        let (a, b) = (corrected.frame(1).unwrap(), source.frame(1).unwrap());
+        assert_eq!(
+            (a.index, a.name, a.time, a.left),
+            (b.index, b.name, b.time, b.left)
+        );
+        assert_ne!(a.right, b.right);
+    }
+
+    /// One grey pair.
+    struct Blank(RectifiedRig);
+
+    impl StereoSource for Blank {
+        fn rig(&self) -> &RectifiedRig {
+            &self.0
+        }
+        fn len(&self) -> usize {
+            1
+        }
+        fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
+            let image = Rgb::from_pixel(
+                self.0.width as u32,
+                self.0.height as u32,
+                image::Rgb([0.5; 3]),
+            );
+            Ok(StereoFrame {
+                index,
+                name: String::new(),
+                time: 0.0,
+                left: image.clone(),
+                right: image,
+            })
+        }
+    }
+
+    #[test]
+    fn nothing_is_claimed_of_pairs_without_texture_or_too_small() {
+        for (width, height) in [(200, 150), (20, 20), (1, 1)] {
+            let rig = RectifiedRig {
+                width,
+                height,
+                ..*traverse().rig()
+            };
+            let rows = measure_row_offset(&Blank(rig)).unwrap();
+            assert!(rows.matches == 0 && rows.offset.is_nan() && !needs_correction(&rows));
+        }
+    }
+
+    fn shared(folder: &str) -> Option<PathBuf> {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../../shared/data")
+            .join(folder);
+        if !path.exists() {
+            println!("skipped: {} is absent", path.display());
+        }
+        path.exists().then_some(path)
+    }
+
+    #[test]
+    fn real_pairs_have_the_offsets_that_are_known_of_them() {
+        // devon1 was rectified by its publisher to half a pixel: correlation along rows peaks
+        // where its right image is moved down by 0.5 px.
+        for (folder, expected) in [
+            ("arena-unlabelled", 3.1),
+            ("arena-run1", 0.0),
+            ("devon1", -0.5),
+        ] {
+            let Some(path) = shared(folder) else { continue };
+            let source = open(path.to_str().unwrap()).unwrap();
+            let rows = measure_row_offset(&*source).unwrap();
+            assert!(
+                (rows.offset - expected).abs() < 0.2 && rows.matches > 200,
+                "{folder}: {rows:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn middlebury_rows_correspond() {
+        let Some(cones) = shared("middlebury2003/cones") else {
+            return;
+        };
+        let dir = tempfile::tempdir().unwrap();
+        for (side, image) in [("left", "im2.png"), ("right", "im6.png")] {
+            std::fs::create_dir(dir.path().join(side)).unwrap();
+            std::fs::copy(cones.join(image), dir.path().join(side).join("cones.png")).unwrap();
+        }
+        let rig = RectifiedRig {
+            width: 450,
+            height: 375,
+            ..*traverse().rig()
+        };
+        std::fs::write(
+            dir.path().join("rig.toml"),
+            barchan_geometry::Rig::from(rig).to_toml(),
+        )
+        .unwrap();
+        let rows = measure_row_offset(&*open(dir.path().to_str().unwrap()).unwrap()).unwrap();
+        assert!(rows.offset.abs() < 0.15 && rows.matches > 200, "{rows:?}");
+    }
 }

@@ -482,8 +482,10 @@ mod tests {
             assert!((ground.height(x, y) - ground.height(x + PERIOD, y - PERIOD)).abs() < 1e-5);
             let n = ground.normal(x, y);
             let e = 1e-3;
-            let dh = ground.height(x + e, y + e) - ground.height(x, y);
-            assert!((n.x * e + n.y * e + n.z * dh).abs() < 2e-4 * e.max(dh.abs()) + 1e-5);
+            let slope_x = (ground.height(x + e, y) - ground.height(x - e, y)) / (2.0 * e);
+            let slope_y = (ground.height(x, y + e) - ground.height(x, y - e)) / (2.0 * e);
+            assert!((n.norm() - 1.0).abs() < 1e-12);
+            assert!((-n.x / n.z - slope_x).abs() < 5e-3 && (-n.y / n.z - slope_y).abs() < 5e-3);
         }
     }
 }

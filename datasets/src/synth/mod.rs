@@ -26,20 +26,20 @@ use texture::{Footprint, Texture};
 
 /// The options of a synthetic traverse.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SynthOptions {
+struct Options {
     /// Chooses the ground, the route and the noise.
-    pub seed: u64,
+    seed: u64,
     /// How many frames. About 700 drive the circle once.
-    pub frames: usize,
+    frames: usize,
     /// Image width, pixels.
-    pub width: usize,
+    width: usize,
     /// Image height, pixels.
-    pub height: usize,
+    height: usize,
     /// Standard deviation of the sensor noise, grey levels of 255.
-    pub noise: f64,
+    noise: f64,
 }
 
-impl Default for SynthOptions {
+impl Default for Options {
     fn default() -> Self {
         Self {
             seed: 1,
@@ -53,7 +53,7 @@ impl Default for SynthOptions {
 
 /// Format `synth`: the rendered traverse.
 pub struct Synth {
-    options: SynthOptions,
+    options: Options,
     rig: RectifiedRig,
     ground: Ground,
     grain: Texture<1>,
@@ -81,7 +81,7 @@ impl Synth {
     /// # Errors
     /// When an option is unknown or out of range; the message names it.
     pub fn parse(spec: &str) -> Result<Self, DataError> {
-        let mut options = SynthOptions::default();
+        let mut options = Options::default();
         let bad = |message: String| DataError::Layout {
             spec: format!("synth:{spec}"),
             message,
@@ -134,7 +134,7 @@ impl Synth {
     }
 
     /// Makes the ground and the route. Frames are rendered when asked for.
-    pub fn new(options: SynthOptions) -> Self {
+    fn new(options: Options) -> Self {
         let focal = 0.8 * options.width as f64;
         let rig = RectifiedRig {
             width: options.width,
@@ -170,17 +170,17 @@ impl Synth {
         self.ground.height(x, y)
     }
 
-    /// Depth of the ray through a pixel (of either camera: `shift` metres along x), and its hit.
-    fn look(&self, T_world_cam: &Se3, shift: f64, u: usize, v: usize) -> Option<Hit> {
+    /// The ray through a pixel, in the world. It has z = 1 in the camera, so that the parameter
+    /// along it is the depth.
+    fn ray(&self, T_world_cam: &Se3, u: f64, v: f64) -> Vector3<f64> {
         let rig = &self.rig;
-        let ray_cam = Vector3::new(
-            (u as f64 - rig.cx) / rig.fx,
-            (v as f64 - rig.cy) / rig.fy,
-            1.0,
-        );
+        T_world_cam.rotation * Vector3::new((u - rig.cx) / rig.fx, (v - rig.cy) / rig.fy, 1.0)
+    }
+
+    /// What a camera `shift` metres to the right of the left one sees at a pixel.
+    fn look(&self, T_world_cam: &Se3, shift: f64, u: f64, v: f64) -> Option<Hit> {
         let origin = T_world_cam * Point3::new(shift, 0.0, 0.0);
-        let ray = T_world_cam.rotation * ray_cam;
-        // The ray has z = 1 in the camera, so its parameter is the depth.
+        let ray = self.ray(T_world_cam, u, v);
         let depth = self.ground.hit(&origin, &ray, 0.05, FAR)?;
         Some(Hit {
             depth,
@@ -199,14 +199,10 @@ impl Synth {
             .enumerate()
             .for_each(|(v, row)| {
                 for (u, pixel) in row.chunks_exact_mut(3).enumerate() {
+                    let (u, v) = (u as f64, v as f64);
                     let colour = match self.look(&T_world_cam, shift, u, v) {
                         Some(hit) => self.surface(&T_world_cam, &hit),
-                        None => sky(&(T_world_cam.rotation
-                            * Vector3::new(
-                                (u as f64 - self.rig.cx) / self.rig.fx,
-                                (v as f64 - self.rig.cy) / self.rig.fy,
-                                1.0,
-                            ))),
+                        None => sky(&self.ray(&T_world_cam, u, v)),
                     };
                     pixel.copy_from_slice(colour.as_slice());
                 }
@@ -342,7 +338,7 @@ impl StereoSource for Synth {
             .enumerate()
             .for_each(|(v, row)| {
                 for (u, d) in row.iter_mut().enumerate() {
-                    if let Some(hit) = self.look(&pose.T_world_cam, 0.0, u, v) {
+                    if let Some(hit) = self.look(&pose.T_world_cam, 0.0, u as f64, v as f64) {
                         *d = (self.rig.fx * self.rig.baseline / hit.depth) as f32;
                     }
                 }
@@ -439,4 +435,191 @@ fn grain(seed: u32, light_along: Vector2<f32>) -> Texture<1> {
         [patches[k] + 0.45 * (light_along.x * slope_x + light_along.y * slope_y)]
     };
     Texture::new(GRAIN, (0..GRAIN * GRAIN).into_par_iter().map(lit).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::resample::cubic_weights;
+    use barchan_geometry::StereoPoint;
+
+    fn synth(spec: &str) -> Synth {
+        Synth::parse(spec).unwrap()
+    }
+
+    #[test]
+    fn the_right_image_warped_by_the_true_disparity_is_the_left_image() {
+        for seed in [1, 4] {
+            let synth = synth(&format!("seed={seed},frames=30,noise=0"));
+            let index = 17;
+            let T_world_cam = synth.trajectory.poses[index].T_world_cam;
+            let frame = synth.frame(index).unwrap();
+            let disparity = synth.true_disparity(index).unwrap().unwrap();
+            let (w, h) = disparity.dimensions();
+            let (mut error, mut seen, mut known, mut missed) = (0.0, 0, 0, 0);
+            for (u, v) in (0..h).flat_map(|v| (0..w).map(move |u| (u, v))) {
+                let d = f64::from(disparity[(u, v)].0[0]);
+                let at = f64::from(u) - d;
+                if d.is_nan() || at < 1.0 {
+                    continue;
+                }
+                known += 1;
+                // The right camera sees the same point there, or something before it; or, at an
+                // edge that both rays graze, just misses it.
+                let depth = synth.rig.depth(d);
+                let hit = synth.look(&T_world_cam, synth.rig.baseline, at, f64::from(v));
+                let there = hit.map_or(f64::INFINITY, |hit| hit.depth / depth);
+                missed += u32::from(there > 1.0 + 1e-3);
+                if (there - 1.0).abs() > 1e-3 {
+                    continue;
+                }
+                seen += 1;
+                let weights = cubic_weights(at.fract() as f32);
+                for c in 0..3 {
+                    let right: f32 = (0..4u32)
+                        .map(|k| {
+                            weights[k as usize]
+                                * frame.right[((at as u32 + k - 1).min(w - 1), v)].0[c]
+                        })
+                        .sum();
+                    error += f64::from((right - frame.left[(u, v)].0[c]).abs()) / 3.0;
+                }
+            }
+            let error = error / f64::from(seen) * 255.0;
+            assert!(missed < known / 1000, "{missed} of {known}");
+            assert!(error < 1.0, "mean error {error} grey levels");
+            assert!(
+                f64::from(seen) > 0.95 * f64::from(known),
+                "{seen} of {known}"
+            );
+            assert!(f64::from(known) > 0.75 * f64::from(w * h), "{known}");
+        }
+    }
+
+    #[test]
+    fn disparity_back_projects_onto_the_ground_along_the_trajectory() {
+        let synth = synth("seed=9,frames=300,width=128,height=96");
+        for index in [0, 150, 299] {
+            let T_world_cam = synth.true_trajectory().unwrap().poses[index].T_world_cam;
+            let disparity = synth.true_disparity(index).unwrap().unwrap();
+            let mut near = 0;
+            for (u, v, d) in disparity
+                .enumerate_pixels()
+                .filter(|p| p.2.0[0].is_finite())
+            {
+                let at = StereoPoint {
+                    u: f64::from(u),
+                    v: f64::from(v),
+                    d: f64::from(d.0[0]),
+                };
+                let p_cam = synth.rig.back_project(at).unwrap();
+                let p_world = T_world_cam * p_cam;
+                let above = p_world.z - synth.ground_height(p_world.x, p_world.y);
+                assert!(
+                    above.abs() < 2e-5 * p_cam.z.max(1.0),
+                    "{above} at {} m",
+                    p_cam.z
+                );
+                near += usize::from(d.0[0] > 1.0);
+            }
+            // At a third of the default width, a third of the default disparity.
+            assert!(near > 128 * 96 * 7 / 10, "{near}");
+        }
+    }
+
+    #[test]
+    fn the_rover_drives_on_and_looks_down_at_the_ground() {
+        let synth = synth("seed=2,frames=700,width=32,height=32");
+        let poses = &synth.true_trajectory().unwrap().poses;
+        for (a, b) in poses.iter().zip(&poses[1..]) {
+            let T_a_b = a.T_world_cam.inverse() * b.T_world_cam;
+            assert!(
+                (0.04..0.13).contains(&T_a_b.translation.vector.norm()),
+                "{T_a_b}"
+            );
+            assert!(T_a_b.rotation.angle() < 0.06, "{}", T_a_b.rotation.angle());
+            assert!((b.time - a.time - INTERVAL).abs() < 1e-9);
+            let at = a.T_world_cam.translation.vector;
+            let above = at.z - synth.ground_height(at.x, at.y);
+            assert!((0.5..1.1).contains(&above), "{above}");
+            let down = -(a.T_world_cam.rotation * Vector3::z()).z.asin();
+            assert!((0.05..0.7).contains(&down), "{down}");
+        }
+    }
+
+    #[test]
+    fn a_seed_fixes_every_byte_and_another_changes_them() {
+        let spec = "seed=5,frames=9,width=64,height=48";
+        let (a, b, other) = (
+            synth(spec),
+            synth(spec),
+            synth("seed=6,frames=9,width=64,height=48"),
+        );
+        // In another order, after other frames.
+        let first = a.frame(7).unwrap();
+        b.frame(8).unwrap();
+        b.frame(0).unwrap();
+        let again = b.frame(7).unwrap();
+        assert_eq!((&first.left, &first.right), (&again.left, &again.right));
+        assert_ne!(first.left, other.frame(7).unwrap().left);
+        assert_ne!(first.left, a.frame(6).unwrap().left);
+        assert_eq!(a.true_trajectory(), b.true_trajectory());
+        assert!(a.frame(9).is_err() && a.true_disparity(9).is_err());
+    }
+
+    #[test]
+    fn noise_has_the_deviation_asked_for() {
+        let (clean, noisy) = (synth("noise=0,frames=1"), synth("noise=2,frames=1"));
+        let (clean, noisy) = (clean.frame(0).unwrap(), noisy.frame(0).unwrap());
+        let power = |a: &Rgb, b: &Rgb| {
+            let middle = a
+                .iter()
+                .zip(b.iter())
+                .filter(|(a, _)| (0.1..0.9).contains(*a));
+            let (n, sum) = middle.fold((0.0, 0.0), |(n, s), (a, b)| {
+                (n + 1.0, s + f64::from(a - b).powi(2))
+            });
+            (sum / n).sqrt() * 255.0
+        };
+        assert!((power(&clean.left, &noisy.left) - 2.0).abs() < 0.03);
+        assert!((power(&clean.right, &noisy.right) - 2.0).abs() < 0.03);
+        // Independent in the two images: the difference has twice the variance.
+        let left = clean.left.iter().zip(noisy.left.iter()).map(|(a, b)| b - a);
+        let right = clean
+            .right
+            .iter()
+            .zip(noisy.right.iter())
+            .map(|(a, b)| b - a);
+        let (product, n) = left
+            .zip(right)
+            .fold((0.0, 0.0), |(p, n), (a, b)| (p + f64::from(a * b), n + 1.0));
+        assert!((product / n).abs() * 255.0 * 255.0 < 0.05);
+    }
+
+    #[test]
+    fn options_are_checked_by_name() {
+        let defaults = synth("");
+        assert_eq!(
+            (defaults.len(), defaults.rig().width, defaults.rig().height),
+            (60, 384, 288)
+        );
+        for (spec, named) in [
+            ("sead=1", "sead"),
+            ("frames=0", "frames"),
+            ("frames", "frames"),
+            ("width=7", "width"),
+            ("height=99999", "height"),
+            ("seed=-1", "seed"),
+            ("noise=nan", "noise"),
+        ] {
+            let message = Synth::parse(spec)
+                .err()
+                .map(|e| e.to_string())
+                .unwrap_or_default();
+            assert!(
+                message.contains(&format!("synth:{spec}: ")) && message.contains(named),
+                "{message}"
+            );
+        }
+    }
 }
