@@ -31,7 +31,7 @@ impl DisparityEngine for BurnEngine {
         });
         let prediction = self.net.forward(left_tensor, right_tensor);
         let read = |t: Tensor<4>| {
-            t.into_data().to_vec::<f32>().map_err(|e| InferError::Failed { engine: self.name(), message: format!("{e:?}") })
+            t.into_data().try_to_vec::<f32>().map_err(|e| InferError::Failed { engine: self.name(), message: format!("{e:?}") })
         };
         let outputs = [read(prediction.disparity)?, read(prediction.sigma)?, read(prediction.confidence)?];
         DisparityMap::from_network(&self.name(), left.dimensions(), outputs)

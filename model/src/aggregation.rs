@@ -64,7 +64,7 @@ impl Aggregation {
     /// Logits over disparities `[B, D, H, W]` from the volume `[B, C, D, H, W]`; D, H and W
     /// multiples of 4.
     pub fn forward<O: Ops>(&self, ops: &mut O, volume: &O::Volume) -> O::Map {
-        let mut layer = |ops: &mut O, name: &str, conv: &Conv3d, x: &O::Volume| {
+        let layer = |ops: &mut O, name: &str, conv: &Conv3d, x: &O::Volume| {
             let y = ops.conv3d(&format!("aggregation.{name}"), conv, x);
             ops.relu_volume(&y)
         };

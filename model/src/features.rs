@@ -58,7 +58,7 @@ impl Features {
 
     /// Features of normalised images `[B, 3, H, W]`, H and W multiples of 8.
     pub fn forward<O: Ops>(&self, ops: &mut O, scope: &str, image: &O::Map) -> FeatureMaps<O::Map> {
-        let mut layer = |ops: &mut O, name: &str, conv: &Conv2d, x: &O::Map| {
+        let layer = |ops: &mut O, name: &str, conv: &Conv2d, x: &O::Map| {
             let y = ops.conv2d(&format!("{scope}.{name}"), conv, x);
             ops.relu(&y)
         };

@@ -145,7 +145,7 @@ impl StereoNet {
         let bins = self.config.bins();
 
         // Colour cast and exposure, of each camera on its own, go before anything is compared.
-        let mut prepare = |ops: &mut O, image: &O::Map| {
+        let prepare = |ops: &mut O, image: &O::Map| {
             let normal = ops.instance_norm(3, 1e-5, image);
             ops.pad_to_multiple(MULTIPLE, &normal)
         };

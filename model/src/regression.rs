@@ -49,7 +49,7 @@ impl Regression {
         let neighbours = Kernel::from_fn([NEIGHBOURS * SUBPIXELS, 1, 3, 3], |c, _, y, x| {
             f32::from(c / SUBPIXELS == 3 * y + x)
         });
-        let mut up_sample = |ops: &mut O, name: &str, x: &O::Map| {
+        let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
             let padded = ops.pad_edge(1, x);
             let around = ops.fixed_conv2d(&format!("regression.{name}.around"), &neighbours, 1, &padded);
             let weighted = ops.mul(&weights, &around);

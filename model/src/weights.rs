@@ -135,7 +135,8 @@ impl ModuleMapper for Apply {
         match self.tensors.remove(&name) {
             Some(data) if data.shape().to_vec() == expected => {
                 let device = param.val().device();
-                param.map(|_| Tensor::from_data(data, &device).require_grad())
+                let id = param.id;
+                param.transform_for_load(Tensor::from_data(data, &device), id)
             }
             Some(data) => {
                 self.problem = Some(format!("{name} has shape {:?}, expected {expected:?}", data.shape()));

@@ -1,1 +1,62 @@
-//! placeholder
+//! Stereo SLAM in the manner of S-PTAM (Pire 2017), helped by dense disparity (Hong 2021, 3.2.3).
+//!
+//! What it is for: [`Slam::track`] takes rectified pairs one by one and says where the left camera
+//! was; at key frames it asks a [`DisparityEngine`](barchan_infer::DisparityEngine) for dense
+//! disparity, uses it to accept more feature matches, and hands it out for mapping.
+//!
+//! What it promises: the world is the first left camera (x right, y down, z forward); the same
+//! images give the same result, bit by bit; a frame that cannot be placed is reported as lost with a
+//! reason, and the next one is tried again; memory grows with the map, not with the images.
+//!
+//! What it never does: read files, name a network library, or make terrain.
+
+mod bundle_adjustment;
+mod config;
+mod features;
+mod map;
+mod matching;
+mod pose;
+mod tracker;
+
+pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
+pub use config::SlamConfig;
+pub use features::{Descriptor, Features, Keypoint, Orb};
+pub use map::{Keyframe, Map, MapPoint, PointId};
+pub use matching::{DisparityGate, MatchCounts, hamming};
+pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
+pub use tracker::{FrameReport, Slam, SlamResult};
+
+/// Why SLAM cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum SlamError {
+    /// Features could not be found in an image.
+    #[error("frame {frame}: {message}")]
+    Features {
+        /// The frame.
+        frame: String,
+        /// What the detector said.
+        message: String,
+    },
+    /// The disparity engine failed at a key frame.
+    #[error("frame {frame}: {source}")]
+    Disparity {
+        /// The frame.
+        frame: String,
+        /// What the engine said.
+        source: barchan_infer::InferError,
+    },
+    /// A frame has not the size of the rig.
+    #[error("frame {frame}: {width} x {height} pixels, but the rig says {rig_width} x {rig_height}")]
+    Size {
+        /// The frame.
+        frame: String,
+        /// Its width.
+        width: u32,
+        /// Its height.
+        height: u32,
+        /// Width of the rig.
+        rig_width: usize,
+        /// Height of the rig.
+        rig_height: usize,
+    },
+}

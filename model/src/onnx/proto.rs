@@ -70,11 +70,11 @@ pub struct Attribute {
     #[prost(string, tag = "1")]
     pub name: String,
     #[prost(float, optional, tag = "2")]
-    pub float: Option<f32>,
+    pub f: Option<f32>,
     #[prost(int64, optional, tag = "3")]
-    pub int: Option<i64>,
+    pub i: Option<i64>,
     #[prost(bytes = "vec", optional, tag = "4")]
-    pub string: Option<Vec<u8>>,
+    pub s: Option<Vec<u8>>,
     #[prost(int64, repeated, packed = "false", tag = "8")]
     pub ints: Vec<i64>,
     #[prost(int32, tag = "20")]
@@ -83,13 +83,13 @@ pub struct Attribute {
 
 impl Attribute {
     pub fn float(name: &str, value: f32) -> Self {
-        Self { name: name.into(), float: Some(value), kind: 1, ..Self::default() }
+        Self { name: name.into(), f: Some(value), kind: 1, ..Self::default() }
     }
     pub fn int(name: &str, value: i64) -> Self {
-        Self { name: name.into(), int: Some(value), kind: 2, ..Self::default() }
+        Self { name: name.into(), i: Some(value), kind: 2, ..Self::default() }
     }
     pub fn string(name: &str, value: &str) -> Self {
-        Self { name: name.into(), string: Some(value.into()), kind: 3, ..Self::default() }
+        Self { name: name.into(), s: Some(value.into()), kind: 3, ..Self::default() }
     }
     pub fn ints(name: &str, values: impl IntoIterator<Item = usize>) -> Self {
         Self { name: name.into(), ints: values.into_iter().map(|v| v as i64).collect(), kind: 7, ..Self::default() }

@@ -1,0 +1,246 @@
+//! Poses and points together: sparse bundle adjustment by the Schur complement (Triggs 2000).
+
+use barchan_geometry::{RectifiedRig, Se3, se3};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+
+use crate::pose::{HUBER, Observation, huber_cost, huber_weight, reprojection_jacobian};
+
+/// A problem: poses of which some are fixed, points, and who sees what.
+#[allow(non_snake_case)]
+#[derive(Clone, Debug, Default)]
+pub struct BundleAdjustment {
+    /// Poses, each mapping world points to a left camera.
+    pub T_cam_world: Vec<Se3>,
+    /// Which poses stay. At least one must, or the whole floats.
+    pub fixed: Vec<bool>,
+    /// Points, world frame.
+    pub points: Vec<Point3<f64>>,
+    /// Pose, point, and the sighting (whose own `point` is not looked at).
+    pub observations: Vec<(usize, usize, Observation)>,
+}
+
+/// How a solution went.
+#[derive(Clone, Copy, Debug)]
+pub struct Summary {
+    /// Huber cost before.
+    pub before: f64,
+    /// Huber cost after.
+    pub after: f64,
+    /// Iterations done.
+    pub iterations: usize,
+}
+
+impl BundleAdjustment {
+    /// Minimises the Huber loss of all reprojection errors by Levenberg-Marquardt.
+    pub fn solve(&mut self, rig: &RectifiedRig, max_iterations: usize) -> Summary {
+        let free: Vec<Option<usize>> = self
+            .fixed
+            .iter()
+            .scan(0, |next, fixed| {
+                let slot = (!fixed).then_some(*next);
+                *next += usize::from(!fixed);
+                Some(slot)
+            })
+            .collect();
+        let unknown_poses = free.iter().flatten().count();
+        let by_point = self.observations_by_point();
+        let before = self.cost(rig);
+        let (mut current, mut lambda, mut iterations) = (before, 1e-4, 0);
+        while iterations < max_iterations {
+            iterations += 1;
+            let Some((pose_steps, point_steps)) = self.step(rig, &free, unknown_poses, &by_point, lambda) else {
+                lambda *= 10.0;
+                continue;
+            };
+            let (old_poses, old_points) = (self.T_cam_world.clone(), self.points.clone());
+            for (pose, slot) in self.T_cam_world.iter_mut().zip(&free) {
+                if let Some(slot) = slot {
+                    *pose = se3::exp(&pose_steps[*slot]) * *pose;
+                }
+            }
+            for (point, step) in self.points.iter_mut().zip(&point_steps) {
+                *point += step;
+            }
+            let next = self.cost(rig);
+            if next < current {
+                let gained = current - next;
+                (current, lambda) = (next, (lambda * 0.3).max(1e-9));
+                if gained < 1e-4 * current {
+                    break;
+                }
+            } else {
+                (self.T_cam_world, self.points) = (old_poses, old_points);
+                lambda *= 10.0;
+                if lambda > 1e6 {
+                    break;
+                }
+            }
+        }
+        Summary { before, after: current, iterations }
+    }
+
+    /// Squared residual of each observation in standard deviations; infinite behind the camera.
+    pub fn squared_residuals(&self, rig: &RectifiedRig) -> Vec<f64> {
+        let squared = |(pose, point, o): &(usize, usize, Observation)| {
+            let p_cam = self.T_cam_world[*pose] * self.points[*point];
+            o.residual(rig, &p_cam).map_or(f64::INFINITY, |r| r.norm_squared())
+        };
+        self.observations.iter().map(squared).collect()
+    }
+
+    fn cost(&self, rig: &RectifiedRig) -> f64 {
+        self.squared_residuals(rig).into_iter().map(|s| huber_cost(s.min(1e6), HUBER)).sum()
+    }
+
+    fn observations_by_point(&self) -> Vec<Vec<usize>> {
+        let mut by_point = vec![Vec::new(); self.points.len()];
+        for (i, (_, point, _)) in self.observations.iter().enumerate() {
+            by_point[*point].push(i);
+        }
+        by_point
+    }
+
+    /// One damped Gauss-Newton step. Points are eliminated one by one; what is left is a dense
+    /// system over the free poses; points follow by back-substitution.
+    fn step(
+        &self,
+        rig: &RectifiedRig,
+        free: &[Option<usize>],
+        unknown_poses: usize,
+        by_point: &[Vec<usize>],
+        lambda: f64,
+    ) -> Option<(Vec<Vector6<f64>>, Vec<Vector3<f64>>)> {
+        let n = 6 * unknown_poses;
+        let mut reduced = DMatrix::<f64>::zeros(n, n);
+        let mut right = DVector::<f64>::zeros(n);
+        let mut eliminated = Vec::with_capacity(self.points.len());
+        for (point, sightings) in by_point.iter().enumerate() {
+            let mut h_points = Matrix3::<f64>::zeros();
+            let mut g_point = Vector3::<f64>::zeros();
+            // Blocks between this point and the free poses that see it.
+            let mut coupled: Vec<(usize, Matrix6x3<f64>)> = Vec::with_capacity(sightings.len());
+            for i in sightings {
+                let (pose, _, o) = &self.observations[*i];
+                let p_cam = self.T_cam_world[*pose] * self.points[point];
+                let Some(residual) = o.residual(rig, &p_cam) else { continue };
+                let weight = huber_weight(residual.norm_squared(), HUBER);
+                let projection = o.mask(rig.projection_jacobian(&p_cam)) / o.sigma;
+                let by_position: Matrix3<f64> = projection * self.T_cam_world[*pose].rotation.to_rotation_matrix().matrix();
+                h_points += by_position.transpose() * by_position * weight;
+                g_point += by_position.transpose() * residual * weight;
+                if let Some(slot) = free[*pose] {
+                    let mut by_pose: Matrix3x6<f64> = reprojection_jacobian(rig, &p_cam) / o.sigma;
+                    if o.d.is_none() {
+                        by_pose.row_mut(2).fill(0.0);
+                    }
+                    let h_pose: Matrix6<f64> = by_pose.transpose() * by_pose * weight;
+                    let g_pose: Vector6<f64> = by_pose.transpose() * residual * weight;
+                    let mut block = reduced.fixed_view_mut::<6, 6>(6 * slot, 6 * slot);
+                    block += h_pose;
+                    let mut segment = right.fixed_rows_mut::<6>(6 * slot);
+                    segment += g_pose;
+                    coupled.push((slot, by_pose.transpose() * by_position * weight));
+                }
+            }
+            let damped = h_points + Matrix3::from_diagonal(&(h_points.diagonal() * lambda).add_scalar(1e-9));
+            eliminated.push(damped.try_inverse().map(|inverse| (inverse, g_point, coupled)));
+        }
+        for k in 0..n {
+            reduced[(k, k)] += lambda * reduced[(k, k)] + 1e-9;
+        }
+        for (inverse, g_point, coupled) in eliminated.iter().flatten() {
+            for (a, w_a) in coupled {
+                let scaled = w_a * inverse;
+                let mut segment = right.fixed_rows_mut::<6>(6 * a);
+                segment -= scaled * g_point;
+                for (b, w_b) in coupled {
+                    let mut block = reduced.fixed_view_mut::<6, 6>(6 * a, 6 * b);
+                    block -= scaled * w_b.transpose();
+                }
+            }
+        }
+        let solved = if n == 0 { right } else { reduced.cholesky()?.solve(&right) };
+        let pose_steps: Vec<Vector6<f64>> = (0..unknown_poses).map(|k| solved.fixed_rows::<6>(6 * k).into_owned()).collect();
+        let point_steps = eliminated
+            .iter()
+            .map(|e| {
+                e.as_ref().map_or_else(Vector3::zeros, |(inverse, g_point, coupled)| {
+                    let pulled: Vector3<f64> = coupled.iter().map(|(slot, w)| w.transpose() * pose_steps[*slot]).sum();
+                    inverse * (g_point - pulled)
+                })
+            })
+            .collect();
+        Some((pose_steps, point_steps))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pose::tests::{rig, world};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// Six cameras along a path, all points seen by all that have them in view; no noise.
+    fn problem() -> BundleAdjustment {
+        let poses: Vec<Se3> =
+            (0..6).map(|i| se3::exp(&Vector6::new(0.05 * i as f64, 0.0, -0.08 * i as f64, 0.0, 0.02 * i as f64, 0.0))).collect();
+        let points: Vec<Point3<f64>> = world(&poses[2], 120, 5).iter().map(|o| o.point).collect();
+        let mut observations = Vec::new();
+        for (i, pose) in poses.iter().enumerate() {
+            for (j, point) in points.iter().enumerate() {
+                if let Some(s) = rig().project(&(pose * point)).filter(|s| s.u > 0.0 && s.u < 511.0 && s.v > 0.0 && s.v < 287.0) {
+                    let d = (j % 4 != 0).then_some(s.d);
+                    observations.push((i, j, Observation { point: *point, u: s.u, v: s.v, d, sigma: 1.0 }));
+                }
+            }
+        }
+        let fixed = (0..6).map(|i| i == 0).collect();
+        BundleAdjustment { T_cam_world: poses, fixed, points, observations }
+    }
+
+    fn distance(a: &BundleAdjustment, b: &BundleAdjustment) -> f64 {
+        let poses = a.T_cam_world.iter().zip(&b.T_cam_world).map(|(p, q)| se3::log(&(p.inverse() * q)).norm());
+        let points = a.points.iter().zip(&b.points).map(|(p, q)| (p - q).norm());
+        poses.chain(points).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn the_truth_is_a_fixed_point() {
+        let truth = problem();
+        let mut solved = truth.clone();
+        solved.solve(&rig(), 5);
+        assert!(distance(&solved, &truth) < 1e-9);
+    }
+
+    #[test]
+    fn a_perturbed_problem_returns_to_the_truth_despite_false_sightings() {
+        let truth = problem();
+        let mut disturbed = truth.clone();
+        let mut rng = ChaCha8Rng::seed_from_u64(9);
+        let mut jitter = |scale: f64| rng.random_range(-scale..scale);
+        for pose in disturbed.T_cam_world.iter_mut().skip(1) {
+            *pose = se3::exp(&Vector6::from_fn(|_, _| jitter(0.02))) * *pose;
+        }
+        for point in &mut disturbed.points {
+            *point += Vector3::from_fn(|_, _| jitter(0.03));
+        }
+        let summary = disturbed.solve(&rig(), 40);
+        assert!(summary.after < 1e-3 * summary.before, "{summary:?}");
+        assert!(distance(&disturbed, &truth) < 1e-3, "{}", distance(&disturbed, &truth));
+        // Fixed poses do not move at all.
+        assert_eq!(disturbed.T_cam_world[0], truth.T_cam_world[0]);
+
+        // A twentieth of the sightings are false: Huber keeps them from deciding.
+        let mut spoiled = truth.clone();
+        for (i, (_, _, o)) in spoiled.observations.iter_mut().enumerate() {
+            if i % 20 == 0 {
+                o.u += 25.0;
+            }
+        }
+        spoiled.solve(&rig(), 40);
+        let poses = spoiled.T_cam_world.iter().zip(&truth.T_cam_world);
+        let worst = poses.map(|(p, q)| se3::log(&(p.inverse() * q)).norm()).fold(0.0, f64::max);
+        assert!(worst < 0.02, "{worst}");
+    }
+}

@@ -1,0 +1,56 @@
+use serde::{Deserialize, Serialize};
+
+/// Everything that decides how SLAM runs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SlamConfig {
+    /// Key points looked for in each image.
+    pub features: usize,
+    /// Smallest brightness step of a corner, of 255.
+    pub corner_threshold: f32,
+    /// Nearest-neighbour distance ratio below which a stereo match is accepted on looks alone.
+    pub nndr: f64,
+    /// Most differing bits, of 256, of two descriptors that match.
+    pub max_hamming: u32,
+    /// Largest row difference of a stereo match, pixels, at the finest octave.
+    pub row_tolerance: f64,
+    /// Smallest disparity of a point that is mapped, pixels; smaller ones say too little of depth.
+    pub min_disparity: f64,
+    /// Whether dense disparity at key frames accepts and refuses matches (Hong 2021, 3.2.3).
+    pub gate: bool,
+    /// Largest difference between feature disparity and dense disparity, pixels (Hong 2021, 4.2.2).
+    pub gate_px: f64,
+    /// Largest accepted dissimilarity of dense disparity, see `barchan_infer::Rejection`.
+    pub max_dissimilarity: f32,
+    /// A key frame is made when matches fall under this share of the most since the last one.
+    pub keyframe_ratio: f64,
+    /// Key frames that bundle adjustment moves.
+    pub window: usize,
+    /// Most iterations of a bundle adjustment.
+    pub ba_iterations: usize,
+    /// Fewest inliers of a frame that counts as tracked.
+    pub min_inliers: usize,
+    /// Seeds the sampling of the fall-back.
+    pub seed: u64,
+}
+
+impl Default for SlamConfig {
+    fn default() -> Self {
+        Self {
+            features: 1200,
+            corner_threshold: 8.0,
+            nndr: 0.75,
+            max_hamming: 64,
+            row_tolerance: 1.5,
+            min_disparity: 1.5,
+            gate: true,
+            gate_px: 3.0,
+            max_dissimilarity: 0.4,
+            keyframe_ratio: 0.9,
+            window: 8,
+            ba_iterations: 8,
+            min_inliers: 15,
+            seed: 1,
+        }
+    }
+}

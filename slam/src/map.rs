@@ -1,0 +1,119 @@
+//! Key frames, the points they see, and who sees what.
+
+use std::collections::BTreeMap;
+
+use barchan_geometry::Se3;
+use nalgebra::Point3;
+
+use crate::features::{Descriptor, Features};
+
+/// Names a point of the map for good.
+pub type PointId = usize;
+
+/// A frame that the map keeps.
+#[derive(Clone, Debug)]
+#[allow(non_snake_case)]
+pub struct Keyframe {
+    /// Index of the frame in its sequence.
+    pub frame: usize,
+    /// Name of the frame.
+    pub name: String,
+    /// Seconds.
+    pub time: f64,
+    /// Maps world points to the left camera.
+    pub T_cam_world: Se3,
+    /// Features of the left image.
+    pub features: Features,
+    /// Disparity of each feature, where it was matched in the right image, pixels.
+    pub disparities: Vec<Option<f64>>,
+    /// The map point that each feature sees.
+    pub points: Vec<Option<PointId>>,
+}
+
+/// A point of the world that key frames see.
+#[derive(Clone, Debug)]
+pub struct MapPoint {
+    /// Where, world frame, metres.
+    pub position: Point3<f64>,
+    /// What it looked like when last seen by a key frame.
+    pub descriptor: Descriptor,
+    /// Pyramid level at which it was last seen.
+    pub octave: u8,
+    /// Its colour, sRGB.
+    pub colour: [u8; 3],
+    /// Key frame and feature of each sighting.
+    pub observations: Vec<(usize, usize)>,
+}
+
+/// Everything known so far.
+#[derive(Clone, Debug, Default)]
+pub struct Map {
+    /// Key frames in the order of time.
+    pub keyframes: Vec<Keyframe>,
+    /// Points by name; ordered, so that every walk over them is the same.
+    pub points: BTreeMap<PointId, MapPoint>,
+    next: PointId,
+}
+
+impl Map {
+    /// Adds a point seen by feature `feature` of key frame `keyframe`.
+    pub fn add_point(&mut self, keyframe: usize, feature: usize, position: Point3<f64>, colour: [u8; 3]) -> PointId {
+        let id = self.next;
+        self.next += 1;
+        let frame = &mut self.keyframes[keyframe];
+        frame.points[feature] = Some(id);
+        let point = MapPoint {
+            position,
+            descriptor: frame.features.descriptors[feature],
+            octave: frame.features.keypoints[feature].octave,
+            colour,
+            observations: vec![(keyframe, feature)],
+        };
+        self.points.insert(id, point);
+        id
+    }
+
+    /// Notes that a feature of a key frame sees a point; the point takes the newer look.
+    pub fn observe(&mut self, keyframe: usize, feature: usize, id: PointId) {
+        let frame = &mut self.keyframes[keyframe];
+        if let Some(point) = self.points.get_mut(&id) {
+            frame.points[feature] = Some(id);
+            point.observations.push((keyframe, feature));
+            point.descriptor = frame.features.descriptors[feature];
+            point.octave = frame.features.keypoints[feature].octave;
+        }
+    }
+
+    /// Forgets one sighting, and the point with its last one.
+    pub fn forget(&mut self, id: PointId, keyframe: usize) {
+        let Some(point) = self.points.get_mut(&id) else {
+            return;
+        };
+        point.observations.retain(|(k, feature)| {
+            if *k == keyframe {
+                self.keyframes[*k].points[*feature] = None;
+            }
+            *k != keyframe
+        });
+        if point.observations.is_empty() {
+            self.points.remove(&id);
+        }
+    }
+
+    /// Forgets a point.
+    pub fn remove(&mut self, id: PointId) {
+        if let Some(point) = self.points.remove(&id) {
+            for (keyframe, feature) in point.observations {
+                self.keyframes[keyframe].points[feature] = None;
+            }
+        }
+    }
+
+    /// Points seen by any of the key frames from `first` on, in order.
+    pub fn points_since(&self, first: usize) -> Vec<PointId> {
+        let mut ids: Vec<PointId> = self.keyframes[first.min(self.keyframes.len())..].iter().flat_map(|k| k.points.iter().flatten().copied()).collect();
+        ids.sort_unstable();
+        ids.dedup();
+        ids
+    }
+}

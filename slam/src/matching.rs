@@ -1,0 +1,314 @@
+//! Which features are of one thing: left to right along rows, and map to image.
+
+use barchan_datasets::Plane;
+use serde::{Deserialize, Serialize};
+
+use crate::features::{Descriptor, Features};
+use crate::{Keypoint, SlamConfig};
+
+/// Differing bits of two descriptors.
+pub fn hamming(a: &Descriptor, b: &Descriptor) -> u32 {
+    let words = |d: &Descriptor| -> [u64; 4] {
+        std::array::from_fn(|i| u64::from_le_bytes(std::array::from_fn(|k| d[8 * i + k])))
+    };
+    words(a).iter().zip(words(b)).map(|(x, y)| (x ^ y).count_ones()).sum()
+}
+
+/// How many stereo matches each rule decided (Hong 2021, table 1).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MatchCounts {
+    /// Accepted by the distance ratio; the dense map agrees or is silent.
+    pub ratio: usize,
+    /// Too ambiguous for the ratio, accepted because the dense map agrees.
+    pub gate: usize,
+    /// Accepted by the ratio, refused because the dense map contradicts.
+    pub refused: usize,
+}
+
+/// Dense disparity as a witness for feature matches (Hong 2021, 3.2.3).
+#[derive(Clone, Copy, Debug)]
+pub struct DisparityGate<'a> {
+    /// Dense disparity of the left image, NaN unknown.
+    pub disparity: &'a Plane,
+    /// Largest difference that still agrees, pixels.
+    pub threshold: f64,
+}
+
+impl DisparityGate<'_> {
+    /// Whether the map agrees with a feature's disparity; `None` where it does not know.
+    pub fn agrees(&self, keypoint: &Keypoint, disparity: f64) -> Option<bool> {
+        let (u, v) = (keypoint.u.round() as u32, keypoint.v.round() as u32);
+        let dense = f64::from(self.disparity.get_pixel_checked(u, v)?.0[0]);
+        dense.is_finite().then(|| (dense - disparity).abs() < self.threshold)
+    }
+}
+
+/// Disparity of each left feature, where it has a match in the right image.
+///
+/// A candidate lies in the same rows, at most an octave away, with a disparity in `0..max`. The
+/// nearest neighbour by descriptor is accepted when it is clearly nearer than the second **or** the
+/// gate agrees with it, and refused when the gate contradicts it; the position is then refined by
+/// correlation to a fraction of a pixel.
+pub(crate) fn stereo_matches(
+    left: &Features,
+    right: &Features,
+    images: [&Plane; 2],
+    max_disparity: f64,
+    gate: Option<&DisparityGate>,
+    config: &SlamConfig,
+) -> (Vec<Option<f64>>, MatchCounts) {
+    let mut counts = MatchCounts::default();
+    let rows = by_row(&right.keypoints, images[1].height() as usize);
+    let disparities = left
+        .keypoints
+        .iter()
+        .zip(&left.descriptors)
+        .map(|(keypoint, descriptor)| {
+            let reach = config.row_tolerance * keypoint.sigma();
+            let in_reach = |r: &Keypoint| {
+                (r.v - keypoint.v).abs() <= reach
+                    && r.octave.abs_diff(keypoint.octave) <= 1
+                    && (-1.0..max_disparity).contains(&(keypoint.u - r.u))
+            };
+            let from = (keypoint.v - reach).max(0.0) as usize;
+            let to = ((keypoint.v + reach) as usize + 1).min(rows.len());
+            let candidates = rows.get(from..to)?.iter().flatten().copied().filter(|r| in_reach(&right.keypoints[*r]));
+            let (best, distance, second) = two_nearest(descriptor, candidates, right)?;
+            if distance > config.max_hamming {
+                return None;
+            }
+            let coarse = keypoint.u - right.keypoints[best].u;
+            let by_ratio = f64::from(distance) < config.nndr * f64::from(second);
+            match (by_ratio, gate.and_then(|g| g.agrees(keypoint, coarse))) {
+                (true, Some(false)) => {
+                    counts.refused += 1;
+                    return None;
+                }
+                (true, _) => counts.ratio += 1,
+                (false, Some(true)) => counts.gate += 1,
+                (false, _) => return None,
+            }
+            refine_disparity(images, keypoint, coarse)
+        })
+        .collect();
+    (disparities, counts)
+}
+
+/// Indices of key points by their row.
+fn by_row(keypoints: &[Keypoint], height: usize) -> Vec<Vec<usize>> {
+    let mut rows = vec![Vec::new(); height];
+    for (i, keypoint) in keypoints.iter().enumerate() {
+        if let Some(row) = rows.get_mut(keypoint.v.max(0.0) as usize) {
+            row.push(i);
+        }
+    }
+    rows
+}
+
+/// The nearest feature, its distance, and that of the nearest one elsewhere: the same corner at a
+/// neighbouring octave, within 3 pixels, is no rival.
+fn two_nearest(
+    descriptor: &Descriptor,
+    candidates: impl Iterator<Item = usize>,
+    features: &Features,
+) -> Option<(usize, u32, u32)> {
+    let mut all: Vec<(u32, usize)> = candidates.map(|i| (hamming(descriptor, &features.descriptors[i]), i)).collect();
+    all.sort_unstable();
+    let (distance, best) = *all.first()?;
+    let at = features.keypoints[best];
+    let elsewhere = |i: usize| {
+        let k = features.keypoints[i];
+        (k.u - at.u).abs() > 3.0 || (k.v - at.v).abs() > 3.0
+    };
+    let second = all.iter().find(|(_, i)| elsewhere(*i)).map_or(256, |(d, _)| *d);
+    Some((best, distance, second))
+}
+
+/// Zero-mean correlation of an 11x11 window along the row around the coarse match, and a parabola
+/// through its peak. `None` when the peak is not inside the search.
+fn refine_disparity([left, right]: [&Plane; 2], keypoint: &Keypoint, coarse: f64) -> Option<f64> {
+    const RADIUS: i64 = 5;
+    const REACH: i64 = 4;
+    let (u, v) = (keypoint.u.round() as i64, keypoint.v.round() as i64);
+    let u_right = (keypoint.u - coarse).round() as i64;
+    let (width, height) = (i64::from(left.width()), i64::from(left.height()));
+    let inside = |x: i64, reach: i64| x - RADIUS - reach >= 0 && x + RADIUS + reach < width;
+    if !(inside(u, 0) && inside(u_right, REACH) && v >= RADIUS && v + RADIUS < height) {
+        return None;
+    }
+    let window = |image: &Plane, x: i64| {
+        let mut values = [0.0f64; 121];
+        let mut k = 0;
+        for dy in -RADIUS..=RADIUS {
+            for dx in -RADIUS..=RADIUS {
+                values[k] = f64::from(image.as_raw()[((v + dy) * width + x + dx) as usize]);
+                k += 1;
+            }
+        }
+        let mean = values.iter().sum::<f64>() / 121.0;
+        values.iter_mut().for_each(|value| *value -= mean);
+        values
+    };
+    let reference = window(left, u);
+    let energy = |w: &[f64; 121]| w.iter().map(|v| v * v).sum::<f64>();
+    let reference_energy = energy(&reference);
+    let scores: [f64; 2 * REACH as usize + 1] = std::array::from_fn(|k| {
+        let other = window(right, u_right + k as i64 - REACH);
+        let product: f64 = reference.iter().zip(&other).map(|(a, b)| a * b).sum();
+        product / (reference_energy * energy(&other)).sqrt().max(1e-9)
+    });
+    let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]))?;
+    if best == 0 || best + 1 == scores.len() || scores[best] < 0.6 {
+        return None;
+    }
+    let (before, peak, after) = (scores[best - 1], scores[best], scores[best + 1]);
+    let offset = 0.5 * (before - after) / (before - 2.0 * peak + after);
+    let at_right = u_right as f64 + best as f64 - REACH as f64 + offset.clamp(-0.5, 0.5);
+    // The window sat on whole pixels; the feature's own fraction moves with it.
+    Some(u as f64 - at_right)
+}
+
+/// A feature of the image for each map point that is expected in it: `expected` gives descriptor,
+/// position and octave of point `i`. A feature takes the point that looks most like it.
+pub(crate) fn match_projections(
+    expected: &[(Descriptor, Keypoint)],
+    features: &Features,
+    grid: &Grid,
+    radius: f64,
+    config: &SlamConfig,
+) -> Vec<(usize, usize)> {
+    // For each feature, the best point so far.
+    let mut taken: Vec<Option<(u32, usize)>> = vec![None; features.keypoints.len()];
+    for (point, (descriptor, at)) in expected.iter().enumerate() {
+        let reach = radius * at.sigma().sqrt();
+        let near = |i: &usize| {
+            let k = features.keypoints[*i];
+            (k.u - at.u).abs() <= reach && (k.v - at.v).abs() <= reach && k.octave.abs_diff(at.octave) <= 2
+        };
+        let candidates = grid.around(at.u, at.v, reach).filter(near);
+        let Some((best, distance, second)) = two_nearest(descriptor, candidates, features) else {
+            continue;
+        };
+        if distance > config.max_hamming || f64::from(distance) > 0.9 * f64::from(second) {
+            continue;
+        }
+        if taken[best].is_none_or(|(d, _)| distance < d) {
+            taken[best] = Some((distance, point));
+        }
+    }
+    taken.iter().enumerate().filter_map(|(feature, t)| t.map(|(_, point)| (point, feature))).collect()
+}
+
+/// Pairs of two descriptor sets that are nearest to each other and pass the ratio.
+pub(crate) fn match_all(a: &[Descriptor], b: &Features, config: &SlamConfig) -> Vec<(usize, usize)> {
+    let forward: Vec<Option<(usize, u32)>> = a
+        .iter()
+        .map(|descriptor| {
+            let (best, distance, second) = two_nearest(descriptor, 0..b.descriptors.len(), b)?;
+            (distance <= config.max_hamming && f64::from(distance) < config.nndr * f64::from(second)).then_some((best, distance))
+        })
+        .collect();
+    let mut taken: Vec<Option<(u32, usize)>> = vec![None; b.descriptors.len()];
+    for (i, found) in forward.iter().enumerate() {
+        if let Some((best, distance)) = found
+            && taken[*best].is_none_or(|(d, _)| *distance < d)
+        {
+            taken[*best] = Some((*distance, i));
+        }
+    }
+    taken.iter().enumerate().filter_map(|(j, t)| t.map(|(_, i)| (i, j))).collect()
+}
+
+/// Key points by cells of the image, for looking around a place.
+pub(crate) struct Grid {
+    columns: usize,
+    rows: usize,
+    cells: Vec<Vec<usize>>,
+}
+
+impl Grid {
+    const CELL: f64 = 24.0;
+
+    pub fn new(keypoints: &[Keypoint], width: usize, height: usize) -> Self {
+        let columns = (width as f64 / Self::CELL) as usize + 1;
+        let rows = (height as f64 / Self::CELL) as usize + 1;
+        let mut cells = vec![Vec::new(); columns * rows];
+        for (i, k) in keypoints.iter().enumerate() {
+            let (x, y) = ((k.u / Self::CELL) as usize, (k.v / Self::CELL) as usize);
+            cells[y.min(rows - 1) * columns + x.min(columns - 1)].push(i);
+        }
+        Self { columns, rows, cells }
+    }
+
+    fn around(&self, u: f64, v: f64, reach: f64) -> impl Iterator<Item = usize> + '_ {
+        let range = |at: f64, count: usize| {
+            let from = ((at - reach) / Self::CELL).max(0.0) as usize;
+            let to = ((at + reach) / Self::CELL).max(-1.0) + 1.0;
+            from..(to as usize).min(count)
+        };
+        let columns = range(u, self.columns);
+        range(v, self.rows).flat_map(move |y| columns.clone().flat_map(move |x| self.cells[y * self.columns + x].iter().copied()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hamming_counts_differing_bits() {
+        let mut other = [0u8; 32];
+        assert_eq!(hamming(&[0; 32], &other), 0);
+        other[3] = 0b101;
+        other[31] = 0x80;
+        assert_eq!(hamming(&[0; 32], &other), 3);
+        assert_eq!(hamming(&[0; 32], &[0xff; 32]), 256);
+    }
+
+    /// A texture and itself moved by a fraction of a pixel.
+    fn shifted(by: f64) -> [Plane; 2] {
+        let texture = |x: f64, y: f64| {
+            let waves = (0.9 * x + 0.3 * y).sin() + (0.35 * x - 0.8 * y).sin() + (0.21 * x + 0.13 * y).cos();
+            (0.5 + 0.15 * waves) as f32
+        };
+        [0.0, by].map(|d| Plane::from_fn(80, 40, |x, y| image::Luma([texture(f64::from(x) + d, f64::from(y))])))
+    }
+
+    #[test]
+    fn refinement_finds_fractions_of_a_pixel() {
+        for true_disparity in [4.0, 5.3, 6.75] {
+            let [left, right] = shifted(true_disparity);
+            let at = Keypoint { u: 40.0, v: 20.0, octave: 0 };
+            let found = refine_disparity([&left, &right], &at, 5.0).unwrap();
+            assert!((found - true_disparity).abs() < 0.1, "{true_disparity}: {found}");
+        }
+    }
+
+    #[test]
+    fn the_gate_admits_the_ambiguous_and_refuses_the_contradicted() {
+        let [left, right] = shifted(6.0);
+        let keypoint = |u: f64| Keypoint { u, v: 20.0, octave: 0 };
+        let features = |us: &[f64]| Features {
+            keypoints: us.iter().map(|u| keypoint(*u)).collect(),
+            descriptors: vec![[7; 32]; us.len()],
+        };
+        let config = SlamConfig::default();
+        let dense = |d: f32| Plane::from_pixel(80, 40, image::Luma([d]));
+        let run = |right_us: &[f64], gate: Option<f32>| {
+            let map = gate.map(dense);
+            let gate = map.as_ref().map(|disparity| DisparityGate { disparity, threshold: 3.0 });
+            stereo_matches(&features(&[40.0]), &features(right_us), [&left, &right], 60.0, gate.as_ref(), &config)
+        };
+        // Two equal candidates: the ratio cannot choose, the gate can.
+        let (none, _) = run(&[34.0, 20.0], None);
+        assert_eq!(none, [None]);
+        let (found, counts) = run(&[34.0, 20.0], Some(6.0));
+        assert!((found[0].unwrap() - 6.0).abs() < 0.1);
+        assert_eq!(counts.gate, 1);
+        // One candidate: the ratio accepts it, a contradicting map refuses it.
+        let (found, counts) = run(&[34.0], None);
+        assert!(found[0].is_some() && counts.ratio == 1);
+        let (found, counts) = run(&[34.0], Some(30.0));
+        assert_eq!((found[0], counts.refused), (None, 1));
+    }
+}

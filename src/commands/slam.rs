@@ -1,0 +1,170 @@
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
+use barchan_geometry::{Rig, Trajectory};
+use barchan_infer::DisparityMap;
+use barchan_slam::{MatchCounts, Slam, SlamConfig, SlamResult};
+use barchan_terrain::{Cloud, CloudPoint};
+use clap::Parser;
+use serde::Serialize;
+
+use crate::data::open_checked;
+use crate::engine::load_engine;
+use crate::output::{Output, StagedDir, percentiles};
+
+/// Track the camera through a sequence and gather dense key frames for `barchan map`
+#[derive(Parser)]
+#[command(after_help = "Examples:\n  \
+    barchan slam --data images/ --model a.onnx --out runs/s\n  \
+    barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches")]
+pub struct Args {
+    /// A stereo sequence: PATH or FORMAT:PATH
+    #[arg(long)]
+    data: String,
+    /// Disparity at key frames: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name
+    #[arg(long, default_value = "tiny")]
+    model: String,
+    /// The run directory that is written
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Disparity does not accept or refuse feature matches
+    #[arg(long)]
+    no_gate: bool,
+    /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Key points looked for in each image
+    #[arg(long)]
+    features: Option<usize>,
+    /// A key frame is made when matches fall under this share
+    #[arg(long)]
+    keyframe_ratio: Option<f64>,
+    /// Threads of the disparity engine; 0 leaves it to the engine
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+}
+
+#[derive(Serialize)]
+struct Summary {
+    frames: usize,
+    tracked: usize,
+    keyframes: usize,
+    loops: usize,
+    points: usize,
+    ms_track_median: f64,
+    ms_track_p95: f64,
+    ms_disparity_median: f64,
+    fps: f64,
+    matches: MatchCounts,
+}
+
+pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
+    let config = configuration(&args)?;
+    let source: Arc<dyn StereoSource> = open_checked(&args.data, output)?.into();
+    let engine = load_engine(&args.model, runtime, args.threads)?;
+    let out = StagedDir::new(&args.out, "summary.json")?;
+    out.write("config.toml", toml::to_string(&config)?)?;
+    out.write("rig.toml", Rig::from(*source.rig()).to_toml())?;
+    let log = out.path("log.jsonl")?;
+    let mut log = std::io::BufWriter::new(std::fs::File::create(&log).with_context(|| log.display().to_string())?);
+
+    let mut slam = Slam::new(*source.rig(), config, Some(engine));
+    let frames = source.len();
+    let bar = output.progress("slam", frames);
+    let (mut tracked, mut track_ms, mut disparity_ms, mut matches) = (0, vec![], vec![], MatchCounts::default());
+    let mut total_ms = 0.0;
+    for frame in prefetch(source, (0..frames).collect(), 4) {
+        let frame = frame?;
+        let mut report = slam.track(&frame)?;
+        if !report.tracked {
+            output.notice(&format!("frame {} is lost: {}", report.name, report.reason));
+        }
+        if let Some(dense) = report.dense.take() {
+            write_keyframe(&out, report.frame, &frame.left, &dense)?;
+            disparity_ms.push(report.ms_disparity);
+            matches.ratio += report.matches.ratio;
+            matches.gate += report.matches.gate;
+            matches.refused += report.matches.refused;
+        }
+        tracked += usize::from(report.tracked);
+        track_ms.push(report.ms_track);
+        total_ms += report.ms_track + report.ms_disparity;
+        writeln!(log, "{}", serde_json::to_string(&report)?)?;
+        bar.inc(1);
+    }
+    log.flush()?;
+    drop(log);
+    bar.finish_and_clear();
+    if tracked == 0 {
+        bail!("{}: no frame could be tracked; the notes above say why", args.data);
+    }
+
+    let result = slam.finish();
+    write_result(&out, &result)?;
+    let (ms_track_median, ms_track_p95) = percentiles(track_ms);
+    let summary = Summary {
+        frames,
+        tracked,
+        keyframes: result.keyframes.len(),
+        loops: 0,
+        points: result.map.points.len(),
+        ms_track_median,
+        ms_track_p95,
+        ms_disparity_median: percentiles(disparity_ms).0,
+        fps: 1e3 * frames as f64 / total_ms,
+        matches,
+    };
+    out.write_json("summary.json", &summary)?;
+    out.finish()?;
+    let text = format!(
+        "{tracked} of {frames} frames tracked, {} key frames, {} points; {ms_track_median:.1} ms a frame (p95 {ms_track_p95:.1}), \
+         {:.1} ms disparity a key frame, {:.1} frames/s\nstereo matches at key frames: {} by ratio, {} more by disparity, {} refused by disparity\n\
+         {}: trajectory.tum trajectory.kitti keyframes.tum map.ply",
+        summary.keyframes,
+        summary.points,
+        summary.ms_disparity_median,
+        summary.fps,
+        matches.ratio,
+        matches.gate,
+        matches.refused,
+        args.out.display(),
+    );
+    output.result(&summary, &text)
+}
+
+fn configuration(args: &Args) -> Result<SlamConfig> {
+    let mut config = match &args.config {
+        None => SlamConfig::default(),
+        Some(path) => {
+            let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+            toml::from_str(&text).with_context(|| path.display().to_string())?
+        }
+    };
+    config.gate &= !args.no_gate;
+    config.features = args.features.unwrap_or(config.features);
+    config.keyframe_ratio = args.keyframe_ratio.unwrap_or(config.keyframe_ratio);
+    Ok(config)
+}
+
+/// Files that sort as their key frames follow each other.
+fn write_keyframe(out: &StagedDir, frame: usize, left: &Rgb, dense: &DisparityMap) -> Result<()> {
+    let path = |folder: &str| out.path(format!("keyframes/{folder}/{frame:06}.png"));
+    disparity_file::write_png(&path("disparity")?, &dense.disparity)?;
+    disparity_file::write_png(&path("sigma")?, &dense.sigma)?;
+    let file = path("left")?;
+    image::DynamicImage::from(left.clone()).to_rgb8().save(&file).with_context(|| file.display().to_string())
+}
+
+fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
+    out.write("trajectory.tum", result.trajectory.to_tum())?;
+    out.write("trajectory.kitti", result.trajectory.to_kitti())?;
+    let keyframes = Trajectory { poses: result.keyframes.iter().map(|(_, _, pose)| *pose).collect() };
+    out.write("keyframes.tum", keyframes.to_tum())?;
+    let point = |p: &barchan_slam::MapPoint| CloudPoint { position: p.position, colour: p.colour, sigma: f32::NAN };
+    let cloud = Cloud { points: result.map.points.values().map(point).collect() };
+    cloud.write_ply(&out.path("map.ply")?)?;
+    Ok(())
+}
