@@ -8,13 +8,13 @@ use burn::tensor::{Device, TensorData};
 use crate::Ops;
 use crate::volume::CENSUS_CHANNELS;
 
-/// How sharply census agreement alone decides at the start: a step of 0.1 in agreement is a factor
+/// How sharply census agreement alone decides at the start: a step of 0.05 in agreement is a factor
 /// of e in probability.
-const CENSUS_GAIN: f32 = 10.0;
+const CENSUS_GAIN: f32 = 20.0;
 
 /// An encoder-decoder over 1/4, 1/8 and 1/16 of the resolution (Zhong 2017, of three levels), and
-/// beside it one linear convolution of the raw volume, which starts as smoothed census matching: an
-/// untrained network already matches blocks, and training refines that.
+/// beside it one linear convolution of the raw volume, which starts as census matching: an untrained
+/// network already matches blocks, and training refines that.
 #[derive(Module, Debug)]
 pub struct Aggregation {
     quarter: Conv3d,
@@ -28,11 +28,12 @@ pub struct Aggregation {
     matching: Conv3d,
 }
 
-fn conv(channels: [usize; 2], stride: usize, gain: f64, device: &Device) -> Conv3d {
+/// A 3x3x3 convolution initialised for a ReLU after it (He 2015).
+fn conv(channels: [usize; 2], stride: usize, device: &Device) -> Conv3d {
     Conv3dConfig::new(channels, [3; 3])
         .with_stride([stride; 3])
         .with_padding(PaddingConfig3d::Explicit(1, 1, 1))
-        .with_initializer(Initializer::KaimingNormal { gain, fan_out_only: false })
+        .with_initializer(Initializer::KaimingNormal { gain: std::f64::consts::SQRT_2, fan_out_only: false })
         .init(device)
 }
 
@@ -44,19 +45,21 @@ fn up(channels: [usize; 2], device: &Device) -> ConvTranspose3d {
 impl Aggregation {
     /// `channels` at 1/4, 1/8 and 1/16; `input` channels, the last two being the census's.
     pub fn init(input: usize, [quarter, eighth, sixteenth]: [usize; 3], device: &Device) -> Self {
-        const RELU: f64 = std::f64::consts::SQRT_2;
-        let mut matching = conv([input, 1], 1, RELU, device);
-        matching.weight = Param::from_data(census_smoothing(input), device);
+        let mut matching =
+            Conv3dConfig::new([input, 1], [3, 1, 1]).with_padding(PaddingConfig3d::Explicit(1, 0, 0)).init(device);
+        matching.weight = Param::from_data(census_matching(input), device);
         Self {
-            quarter: conv([input, quarter], 1, RELU, device),
-            eighth: conv([quarter, eighth], 2, RELU, device),
-            eighth_more: conv([eighth, eighth], 1, RELU, device),
-            sixteenth: conv([eighth, sixteenth], 2, RELU, device),
-            sixteenth_more: conv([sixteenth, sixteenth], 1, RELU, device),
+            quarter: conv([input, quarter], 1, device),
+            eighth: conv([quarter, eighth], 2, device),
+            eighth_more: conv([eighth, eighth], 1, device),
+            sixteenth: conv([eighth, sixteenth], 2, device),
+            sixteenth_more: conv([sixteenth, sixteenth], 1, device),
             up_eighth: up([sixteenth, eighth], device),
             up_quarter: up([eighth, quarter], device),
             // Small, so that the matching convolution speaks first.
-            out: conv([quarter, 1], 1, 0.1, device),
+            out: Conv3dConfig::new([quarter, 1], [1; 3])
+                .with_initializer(Initializer::KaimingNormal { gain: 0.1, fan_out_only: false })
+                .init(device),
             matching,
         }
     }
@@ -86,16 +89,12 @@ impl Aggregation {
     }
 }
 
-/// A 3x3x3 kernel that averages census agreement over 3x3 pixels: the whole bin fully, the half
-/// bins before and behind it by half.
-fn census_smoothing(input: usize) -> TensorData {
-    let mut data = vec![0.0f32; input * 27];
-    let whole = input - CENSUS_CHANNELS;
-    for pixel in 0..9 {
-        let mut set = |channel: usize, d: usize, weight: f32| data[channel * 27 + d * 9 + pixel] = weight * CENSUS_GAIN / 18.0;
-        set(whole, 1, 1.0);
-        set(whole + 1, 0, 0.5);
-        set(whole + 1, 1, 0.5);
-    }
-    TensorData::new(data, [1, input, 3, 3, 3])
+/// A kernel over disparity alone: the whole bin fully, the half bins before and behind it by half.
+fn census_matching(input: usize) -> TensorData {
+    let mut data = vec![0.0f32; input * 3];
+    let whole = 3 * (input - CENSUS_CHANNELS);
+    data[whole + 1] = 0.5 * CENSUS_GAIN;
+    data[whole + 3] = 0.25 * CENSUS_GAIN;
+    data[whole + 4] = 0.25 * CENSUS_GAIN;
+    TensorData::new(data, [1, input, 3, 1, 1])
 }

@@ -35,16 +35,19 @@ pub fn correlation_volume<O: Ops>(
     ops.stack(&planes)
 }
 
-/// Census agreement (-1..=1) of the normalised images at half resolution, averaged to a quarter.
-/// Channel 0 holds the whole bins, channel 1 the disparities half a bin further.
+/// Census agreement (-1..=1) of the normalised images at half resolution, averaged over 8x8 pixels to
+/// a quarter. Channel 0 holds the whole bins, channel 1 the disparities half a bin further.
 pub fn census_volume<O: Ops>(ops: &mut O, left: &O::Map, right: &O::Map, bins: usize) -> O::Volume {
     let (left, right) = (soft_census(ops, left), soft_census(ops, right));
-    let mean = Kernel::from_fn([1, NEIGHBOURS, 2, 2], |_, _, _, _| 1.0 / (4 * NEIGHBOURS) as f32);
+    let mean = Kernel::from_fn([1, NEIGHBOURS, 1, 1], |_, _, _, _| 1.0 / NEIGHBOURS as f32);
+    let window = Kernel::from_fn([1, 1, 4, 4], |_, _, _, _| 1.0 / 16.0);
     let planes: Vec<O::Map> = (0..2 * bins)
         .map(|half_d| {
             let shifted = ops.shift_right(half_d, &right);
             let product = ops.mul(&left, &shifted);
-            ops.fixed_conv2d(&format!("census.{half_d}"), &mean, 2, &product)
+            let agreement = ops.fixed_conv2d(&format!("census.{half_d}"), &mean, 1, &product);
+            let padded = ops.pad_edge(1, &agreement);
+            ops.fixed_conv2d(&format!("census.{half_d}.window"), &window, 2, &padded)
         })
         .collect();
     let half = |odd: usize| planes.iter().skip(odd).step_by(2).cloned().collect::<Vec<_>>();

@@ -52,7 +52,7 @@ pub struct Args {
     #[arg(long, default_value_t = 1)]
     batch: usize,
     /// Height and width of the crops, pixels; larger crops than the images shrink to them
-    #[arg(long, value_names = ["H", "W"], num_args = 2, default_values_t = [256, 384])]
+    #[arg(long, value_names = ["H", "W"], num_args = 2, default_values_t = [192, 320])]
     crop: Vec<usize>,
     /// Learning rate [default: 1e-3, or 1e-4 with --finetune]
     #[arg(long)]
