@@ -17,16 +17,26 @@ pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
     }
     let path = RunDir::weights_of(Path::new(model));
     if path.extension().is_some_and(|e| e == "onnx") {
-        bail!("{model}: an ONNX file cannot be trained or exported again\n  cure: give the run directory or the .safetensors it came from");
+        bail!(
+            "{model}: an ONNX file cannot be trained or exported again\n  cure: give the run directory or the .safetensors it came from"
+        );
     }
     if !path.is_file() {
-        bail!("{}: no such weights\n  cure: give a run of `barchan train`, a .safetensors file, or one of: {}", path.display(), names());
+        bail!(
+            "{}: no such weights\n  cure: give a run of `barchan train`, a .safetensors file, or one of: {}",
+            path.display(),
+            names()
+        );
     }
     Ok(weights::load(&path, device)?)
 }
 
 /// The engine for a model: ONNX Runtime for `x.onnx`, Burn for weights and shipped names.
-pub fn load_engine(model: &str, runtime: Option<&Path>, threads: usize) -> Result<Box<dyn DisparityEngine>> {
+pub fn load_engine(
+    model: &str,
+    runtime: Option<&Path>,
+    threads: usize,
+) -> Result<Box<dyn DisparityEngine>> {
     let path = Path::new(model);
     if path.extension().is_some_and(|e| e == "onnx") {
         // A missing file is the more likely mistake, and the cheaper to find.

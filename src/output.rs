@@ -16,7 +16,11 @@ pub struct Output {
 impl Output {
     /// Prints the result of a command: `text` for people, `value` with `--json`.
     pub fn result(&self, value: &impl Serialize, text: &str) -> Result<()> {
-        let text = if self.json { serde_json::to_string_pretty(value)? } else { text.trim_end().to_owned() };
+        let text = if self.json {
+            serde_json::to_string_pretty(value)?
+        } else {
+            text.trim_end().to_owned()
+        };
         print_line(&text)
     }
 
@@ -39,7 +43,9 @@ impl Output {
             return ProgressBar::hidden();
         }
         let bar = ProgressBar::new(length as u64).with_prefix(what.to_owned());
-        if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:30}] {pos}/{len} {eta} {msg}") {
+        if let Ok(style) =
+            ProgressStyle::with_template("{prefix} [{bar:30}] {pos}/{len} {eta} {msg}")
+        {
             bar.set_style(style.progress_chars("=> "));
         }
         bar
@@ -66,9 +72,14 @@ impl StagedDir {
     /// same kind left it, which `mark` (a file every such run writes) tells.
     pub fn new(target: &Path, mark: &str) -> Result<Self> {
         if target.is_file() {
-            bail!("{}: is a file, and a directory is to be written\n  cure: give another --out", target.display());
+            bail!(
+                "{}: is a file, and a directory is to be written\n  cure: give another --out",
+                target.display()
+            );
         }
-        let occupied = target.read_dir().is_ok_and(|mut entries| entries.next().is_some());
+        let occupied = target
+            .read_dir()
+            .is_ok_and(|mut entries| entries.next().is_some());
         if occupied && !target.join(mark).is_file() {
             bail!(
                 "{}: holds other files, and no {mark} of an earlier run that could be replaced\n  cure: give another --out",
@@ -77,11 +88,16 @@ impl StagedDir {
         }
         let mut stage = target.components().as_path().as_os_str().to_owned();
         stage.push(".part");
-        let staged = Self { stage: stage.into(), target: target.to_owned() };
+        let staged = Self {
+            stage: stage.into(),
+            target: target.to_owned(),
+        };
         if staged.stage.exists() {
-            std::fs::remove_dir_all(&staged.stage).with_context(|| staged.stage.display().to_string())?;
+            std::fs::remove_dir_all(&staged.stage)
+                .with_context(|| staged.stage.display().to_string())?;
         }
-        std::fs::create_dir_all(&staged.stage).with_context(|| staged.stage.display().to_string())?;
+        std::fs::create_dir_all(&staged.stage)
+            .with_context(|| staged.stage.display().to_string())?;
         Ok(staged)
     }
 
@@ -125,6 +141,11 @@ impl Drop for StagedDir {
 /// Median and 95th percentile of times in milliseconds; zero of none.
 pub fn percentiles(mut milliseconds: Vec<f64>) -> (f64, f64) {
     milliseconds.sort_by(f64::total_cmp);
-    let at = |share: f64| milliseconds.get(((milliseconds.len() as f64 - 1.0) * share).round() as usize).copied().unwrap_or(0.0);
+    let at = |share: f64| {
+        milliseconds
+            .get(((milliseconds.len() as f64 - 1.0) * share).round() as usize)
+            .copied()
+            .unwrap_or(0.0)
+    };
     (at(0.5), at(0.95))
 }

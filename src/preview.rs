@@ -10,7 +10,11 @@ pub fn disparity_beside_image(left: &Rgb, disparity: &Plane, range: (f32, f32)) 
     let (low, high) = range;
     RgbImage::from_fn(2 * width, height, |x, y| {
         if x < width {
-            return image::Rgb(left.get_pixel(x, y).0.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8));
+            return image::Rgb(
+                left.get_pixel(x, y)
+                    .0
+                    .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8),
+            );
         }
         let d = disparity.get_pixel(x - width, y).0[0];
         if !d.is_finite() {
@@ -24,7 +28,11 @@ pub fn disparity_beside_image(left: &Rgb, disparity: &Plane, range: (f32, f32)) 
 
 /// The 2nd and 98th percentile of the known disparities; 0 to 1 where none is known.
 pub fn disparity_range(disparity: &Plane) -> (f32, f32) {
-    let mut known: Vec<f32> = disparity.iter().copied().filter(|d| d.is_finite()).collect();
+    let mut known: Vec<f32> = disparity
+        .iter()
+        .copied()
+        .filter(|d| d.is_finite())
+        .collect();
     known.sort_by(f32::total_cmp);
     match known.len() {
         0 => (0.0, 1.0),

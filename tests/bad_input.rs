@@ -29,7 +29,10 @@ impl Case {
             let args = [command, vec!["--data", text(data), "--out", text(&out)]].concat();
             let message = refused(&args);
             for word in wanted {
-                assert!(message.contains(word), "{args:?}: \"{word}\" is not in: {message}");
+                assert!(
+                    message.contains(word),
+                    "{args:?}: \"{word}\" is not in: {message}"
+                );
             }
             let left: Vec<String> = self
                 .dir
@@ -62,7 +65,11 @@ fn one_image_missing() {
 fn two_sizes() {
     let case = Case::new();
     let path = case.data.join("right/000001.png");
-    image::open(&path).unwrap().crop_imm(0, 0, 100, 90).save(&path).unwrap();
+    image::open(&path)
+        .unwrap()
+        .crop_imm(0, 0, 100, 90)
+        .save(&path)
+        .unwrap();
     case.every_reader_refuses(&case.data, &["000001.png", "100", "192"]);
 }
 
@@ -92,8 +99,19 @@ fn not_an_onnx() {
     std::fs::write(&model, b"this is no network").unwrap();
     let out = case.out();
     for command in ["infer", "slam"] {
-        let message = refused(&[command, "--data", text(&case.data), "--model", text(&model), "--out", text(&out)]);
-        assert!(message.contains("model.onnx") && message.contains("cure"), "{message}");
+        let message = refused(&[
+            command,
+            "--data",
+            text(&case.data),
+            "--model",
+            text(&model),
+            "--out",
+            text(&out),
+        ]);
+        assert!(
+            message.contains("model.onnx") && message.contains("cure"),
+            "{message}"
+        );
         assert!(!out.exists());
     }
 }
@@ -105,7 +123,10 @@ fn weights_that_are_none() {
     std::fs::write(&model, b"neither are these").unwrap();
     let onnx = case.dir.path().join("x.onnx");
     let message = refused(&["export", text(&model), "--out", text(&onnx)]);
-    assert!(message.contains("model.safetensors") && message.contains("cure"), "{message}");
+    assert!(
+        message.contains("model.safetensors") && message.contains("cure"),
+        "{message}"
+    );
     assert!(!onnx.exists());
 }
 
@@ -113,7 +134,10 @@ fn weights_that_are_none() {
 fn a_run_that_is_none() {
     let case = Case::new();
     let message = refused(&["map", text(&case.data), "--out", text(&case.out())]);
-    assert!(message.contains("keyframes.tum") && message.contains("barchan slam"), "{message}");
+    assert!(
+        message.contains("keyframes.tum") && message.contains("barchan slam"),
+        "{message}"
+    );
     assert!(!case.out().exists());
 }
 
@@ -125,17 +149,34 @@ fn other_peoples_files_are_not_replaced() {
     std::fs::write(out.join("thesis.txt"), "years of work").unwrap();
     let message = refused(&["infer", "--data", text(&case.data), "--out", text(&out)]);
     assert!(message.contains("--out"), "{message}");
-    assert_eq!(std::fs::read_to_string(out.join("thesis.txt")).unwrap(), "years of work");
+    assert_eq!(
+        std::fs::read_to_string(out.join("thesis.txt")).unwrap(),
+        "years of work"
+    );
 }
 
 #[test]
 fn a_run_is_not_overwritten() {
     let case = Case::new();
     let run = case.out();
-    let args = ["train", "--data", text(&case.data), "--steps", "1", "--crop", "64", "64", "--out", text(&run)];
+    let args = [
+        "train",
+        "--data",
+        text(&case.data),
+        "--steps",
+        "1",
+        "--crop",
+        "64",
+        "64",
+        "--out",
+        text(&run),
+    ];
     barchan().args(args).assert().success();
     let before = std::fs::read(run.join("weights.safetensors")).unwrap();
     let message = refused(&args);
     assert!(message.contains("--resume"), "{message}");
-    assert_eq!(std::fs::read(run.join("weights.safetensors")).unwrap(), before);
+    assert_eq!(
+        std::fs::read(run.join("weights.safetensors")).unwrap(),
+        before
+    );
 }

@@ -8,7 +8,12 @@ use common::{barchan, json, rendered, text};
 
 fn exists(dir: &Path, files: &[&str]) {
     for file in files {
-        assert!(dir.join(file).exists(), "{} is missing in {}", file, dir.display());
+        assert!(
+            dir.join(file).exists(),
+            "{} is missing in {}",
+            file,
+            dir.display()
+        );
     }
 }
 
@@ -16,28 +21,107 @@ fn exists(dir: &Path, files: &[&str]) {
 fn images_become_terrain() {
     let dir = tempfile::tempdir().unwrap();
     let data = rendered(dir.path(), 16);
-    let [train, onnx, infer, slam, map] = ["train", "a.onnx", "infer", "slam", "map"].map(|n| dir.path().join(n));
+    let [train, onnx, infer, slam, map] =
+        ["train", "a.onnx", "infer", "slam", "map"].map(|n| dir.path().join(n));
 
     let trained = json(&[
-        "train", "--data", text(&data), "--epochs", "1", "--finetune", "--preset", "tiny", "--out", text(&train),
+        "train",
+        "--data",
+        text(&data),
+        "--epochs",
+        "1",
+        "--finetune",
+        "--preset",
+        "tiny",
+        "--out",
+        text(&train),
     ]);
-    assert!(trained["photometric_after"].as_f64() < trained["photometric_before"].as_f64(), "{trained}");
-    exists(&train, &["config.toml", "log.jsonl", "summary.json", "weights.safetensors"]);
-    barchan().args(["export", text(&train), "--out", text(&onnx)]).assert().success();
+    assert!(
+        trained["photometric_after"].as_f64() < trained["photometric_before"].as_f64(),
+        "{trained}"
+    );
+    exists(
+        &train,
+        &[
+            "config.toml",
+            "log.jsonl",
+            "summary.json",
+            "weights.safetensors",
+        ],
+    );
+    barchan()
+        .args(["export", text(&train), "--out", text(&onnx)])
+        .assert()
+        .success();
 
-    let inferred = json(&["infer", "--data", text(&data), "--model", text(&onnx), "--out", text(&infer)]);
+    let inferred = json(&[
+        "infer",
+        "--data",
+        text(&data),
+        "--model",
+        text(&onnx),
+        "--out",
+        text(&infer),
+    ]);
     assert_eq!(inferred["frames"], 16);
     assert!(inferred["density"].as_f64().unwrap() > 0.5, "{inferred}");
-    exists(&infer, &["disparity/000000.png", "confidence/000000.png", "preview/000000.png", "cloud/000000.ply"]);
-    let score = json(&["eval", "disparity", "--pred", text(&infer.join("disparity")), "--gt", text(&data)]);
-    assert!(score["estimated"]["bad2"].as_f64().unwrap() < 20.0, "{score}");
+    exists(
+        &infer,
+        &[
+            "disparity/000000.png",
+            "confidence/000000.png",
+            "preview/000000.png",
+            "cloud/000000.ply",
+        ],
+    );
+    let score = json(&[
+        "eval",
+        "disparity",
+        "--pred",
+        text(&infer.join("disparity")),
+        "--gt",
+        text(&data),
+    ]);
+    assert!(
+        score["estimated"]["bad2"].as_f64().unwrap() < 20.0,
+        "{score}"
+    );
 
-    let tracked = json(&["slam", "--data", text(&data), "--model", text(&onnx), "--out", text(&slam)]);
+    let tracked = json(&[
+        "slam",
+        "--data",
+        text(&data),
+        "--model",
+        text(&onnx),
+        "--out",
+        text(&slam),
+    ]);
     assert_eq!(tracked["tracked"], 16, "{tracked}");
-    exists(&slam, &["trajectory.tum", "trajectory.kitti", "keyframes.tum", "map.ply", "summary.json", "config.toml", "log.jsonl"]);
+    exists(
+        &slam,
+        &[
+            "trajectory.tum",
+            "trajectory.kitti",
+            "keyframes.tum",
+            "map.ply",
+            "summary.json",
+            "config.toml",
+            "log.jsonl",
+        ],
+    );
     let gt = data.join("groundtruth.tum");
-    let score = json(&["eval", "trajectory", "--est", text(&slam.join("trajectory.tum")), "--gt", text(&gt)]);
-    let (ate, length) = (score["ate_rmse"].as_f64().unwrap(), score["length"].as_f64().unwrap());
+    let score = json(&[
+        "eval",
+        "trajectory",
+        "--est",
+        text(&slam.join("trajectory.tum")),
+        "--gt",
+        text(&gt),
+    ]);
+    let (ate, length) = (
+        score["ate_rmse"].as_f64().unwrap(),
+        score["length"].as_f64().unwrap(),
+    );
     assert!(ate < 0.02 * length, "{score}");
 
     let mapped = json(&["map", text(&slam), "--out", text(&map)]);
@@ -46,7 +130,16 @@ fn images_become_terrain() {
 
     // The hillshade of the map is that of its own DEM.
     let again = dir.path().join("again.tif");
-    barchan().args(["raster", "hillshade", text(&map.join("dem.tif")), "--out", text(&again)]).assert().success();
+    barchan()
+        .args([
+            "raster",
+            "hillshade",
+            text(&map.join("dem.tif")),
+            "--out",
+            text(&again),
+        ])
+        .assert()
+        .success();
     let read = |path: &Path| barchan_terrain::Raster::<u8>::read(path).unwrap().values;
     assert_eq!(read(&map.join("hillshade.tif")), read(&again));
 }
@@ -56,16 +149,41 @@ fn a_stopped_run_goes_on_to_the_same_weights() {
     let dir = tempfile::tempdir().unwrap();
     let data = rendered(dir.path(), 6);
     let train = |out: &Path, steps: &str| {
-        let common = ["train", "--data", text(&data), "--epochs", "9", "--crop", "64", "96", "--checkpoint-every", "2"];
-        barchan().args(common).args(["--steps", steps, "--out", text(out)]).assert().success();
+        let common = [
+            "train",
+            "--data",
+            text(&data),
+            "--epochs",
+            "9",
+            "--crop",
+            "64",
+            "96",
+            "--checkpoint-every",
+            "2",
+        ];
+        barchan()
+            .args(common)
+            .args(["--steps", steps, "--out", text(out)])
+            .assert()
+            .success();
     };
     let [whole, part] = ["whole", "part"].map(|n| dir.path().join(n));
     train(&whole, "7");
     train(&part, "4");
     // As if it had been stopped on the way to step 7.
     let config = std::fs::read_to_string(part.join("config.toml")).unwrap();
-    std::fs::write(part.join("config.toml"), config.replace("steps = 4", "steps = 7")).unwrap();
-    barchan().args(["train", "--resume", text(&part)]).assert().success();
+    std::fs::write(
+        part.join("config.toml"),
+        config.replace("steps = 4", "steps = 7"),
+    )
+    .unwrap();
+    barchan()
+        .args(["train", "--resume", text(&part)])
+        .assert()
+        .success();
     let weights = |run: &Path| std::fs::read(run.join("weights.safetensors")).unwrap();
-    assert!(weights(&whole) == weights(&part), "the resumed run has other weights");
+    assert!(
+        weights(&whole) == weights(&part),
+        "the resumed run has other weights"
+    );
 }

@@ -12,41 +12,101 @@ fn train_export_and_compare(device: &str, steps: usize) {
     let run = dir.path().join("run");
     let steps_text = steps.to_string();
     let summary = json(&[
-        "train", "--data", text(&data), "--steps", &steps_text, "--epochs", "100", "--lr", "1e-3", "--batch", "2", "--crop",
-        "96", "160", "--device", device, "--out", text(&run),
+        "train",
+        "--data",
+        text(&data),
+        "--steps",
+        &steps_text,
+        "--epochs",
+        "100",
+        "--lr",
+        "1e-3",
+        "--batch",
+        "2",
+        "--crop",
+        "96",
+        "160",
+        "--device",
+        device,
+        "--out",
+        text(&run),
     ]);
     let before = summary["photometric_before"].as_f64().unwrap();
     let after = summary["photometric_after"].as_f64().unwrap();
-    assert!(after < before, "{device}: held-out photometric loss {before} before, {after} after");
+    assert!(
+        after < before,
+        "{device}: held-out photometric loss {before} before, {after} after"
+    );
 
     let log = std::fs::read_to_string(run.join("log.jsonl")).unwrap();
-    let losses: Vec<f64> =
-        log.lines().map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["loss"].as_f64().unwrap()).collect();
+    let losses: Vec<f64> = log
+        .lines()
+        .map(|l| {
+            serde_json::from_str::<serde_json::Value>(l).unwrap()["loss"]
+                .as_f64()
+                .unwrap()
+        })
+        .collect();
     assert_eq!(losses.len(), steps);
     let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
-    let (first, last) = (mean(&losses[..steps / 4]), mean(&losses[steps - steps / 4..]));
-    assert!(last < first, "{device}: loss {first} in the first quarter, {last} in the last");
+    let (first, last) = (
+        mean(&losses[..steps / 4]),
+        mean(&losses[steps - steps / 4..]),
+    );
+    assert!(
+        last < first,
+        "{device}: loss {first} in the first quarter, {last} in the last"
+    );
 
     let onnx = dir.path().join("net.onnx");
-    barchan().args(["export", text(&run), "--out", text(&onnx)]).assert().success();
+    barchan()
+        .args(["export", text(&run), "--out", text(&onnx)])
+        .assert()
+        .success();
     let frames = 6;
     for (model, out) in [(text(&run), "burn"), (text(&onnx), "onnx")] {
         let out = dir.path().join(out);
-        let summary = json(&["infer", "--data", text(&data), "--model", model, "--no-reject", "--out", text(&out)]);
+        let summary = json(&[
+            "infer",
+            "--data",
+            text(&data),
+            "--model",
+            model,
+            "--no-reject",
+            "--out",
+            text(&out),
+        ]);
         assert_eq!(summary["frames"], frames);
         assert_eq!(summary["density"], 1.0);
     }
     let mut differences = Vec::new();
     for frame in 0..frames {
         let read = |engine: &str| {
-            disparity_file::read(&dir.path().join(format!("{engine}/disparity/{frame:06}.pfm"))).unwrap()
+            disparity_file::read(
+                &dir.path()
+                    .join(format!("{engine}/disparity/{frame:06}.pfm")),
+            )
+            .unwrap()
         };
-        differences.extend(read("burn").iter().zip(read("onnx").iter()).map(|(a, b)| (a - b).abs()));
+        differences.extend(
+            read("burn")
+                .iter()
+                .zip(read("onnx").iter())
+                .map(|(a, b)| (a - b).abs()),
+        );
     }
     differences.sort_by(f32::total_cmp);
-    let (median, maximum) = (differences[differences.len() / 2], differences[differences.len() - 1]);
-    println!("{device}: ONNX Runtime against Burn: median {median:.2e} px, maximum {maximum:.2e} px");
-    assert!(median <= 1e-3 && maximum <= 1e-2, "{device}: median {median} px, maximum {maximum} px");
+    let (median, maximum) = (
+        differences[differences.len() / 2],
+        differences[differences.len() - 1],
+    );
+    println!(
+        "{device}: ONNX Runtime against Burn: median {median:.2e} px, maximum {maximum:.2e} px"
+    );
+    assert!(
+        median <= 1e-3 && maximum <= 1e-2,
+        "{device}: median {median} px, maximum {maximum} px"
+    );
 }
 
 #[test]

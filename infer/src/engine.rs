@@ -14,7 +14,12 @@ pub struct DisparityMap {
 impl DisparityMap {
     /// Share of pixels whose disparity is known.
     pub fn density(&self) -> f64 {
-        let known = self.disparity.as_raw().iter().filter(|d| d.is_finite()).count();
+        let known = self
+            .disparity
+            .as_raw()
+            .iter()
+            .filter(|d| d.is_finite())
+            .count();
         known as f64 / self.disparity.as_raw().len().max(1) as f64
     }
 }
@@ -41,15 +46,21 @@ impl DisparityMap {
     ) -> Result<Self, InferError> {
         let plane = |data: Vec<f32>| {
             let found = data.len();
-            Plane::from_raw(width, height, data).filter(|_| found == (width * height) as usize).ok_or_else(|| {
-                InferError::Failed {
+            Plane::from_raw(width, height, data)
+                .filter(|_| found == (width * height) as usize)
+                .ok_or_else(|| InferError::Failed {
                     engine: engine.into(),
-                    message: format!("an output of {found} values for an image of {width} x {height}"),
-                }
-            })
+                    message: format!(
+                        "an output of {found} values for an image of {width} x {height}"
+                    ),
+                })
         };
         let [disparity, sigma, confidence] = outputs;
-        Ok(Self { disparity: plane(disparity)?, sigma: plane(sigma)?, confidence: plane(confidence)? })
+        Ok(Self {
+            disparity: plane(disparity)?,
+            sigma: plane(sigma)?,
+            confidence: plane(confidence)?,
+        })
     }
 }
 

@@ -36,14 +36,20 @@ impl Runtime {
             return if path.is_file() {
                 Ok(path)
             } else {
-                Err(InferError::Unavailable(format!("{}: no ONNX Runtime library there\n  {cure}", path.display())))
+                Err(InferError::Unavailable(format!(
+                    "{}: no ONNX Runtime library there\n  {cure}",
+                    path.display()
+                )))
             };
         }
         let cache = std::env::var_os("XDG_CACHE_HOME")
             .map(PathBuf::from)
             .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))
             .unwrap_or_default();
-        let path = cache.join("barchan/onnxruntime").join(VERSION).join("libonnxruntime.so");
+        let path = cache
+            .join("barchan/onnxruntime")
+            .join(VERSION)
+            .join("libonnxruntime.so");
         if path.is_file() {
             return Ok(path);
         }
@@ -60,7 +66,10 @@ impl Runtime {
     pub fn load(given: Option<&Path>) -> Result<Self, InferError> {
         let path = Self::find(given)?;
         let failed = |message: String| {
-            InferError::Unavailable(format!("{}: does not load as ONNX Runtime 1.17 or later: {message}", path.display()))
+            InferError::Unavailable(format!(
+                "{}: does not load as ONNX Runtime 1.17 or later: {message}",
+                path.display()
+            ))
         };
         let mut shared = ENVIRONMENT.lock().map_err(|e| failed(e.to_string()))?;
         let environment = match shared.as_ref() {
@@ -94,9 +103,14 @@ impl OnnxEngine {
     /// # Errors
     /// When the file is missing, is no ONNX, or has other inputs or outputs.
     pub fn load(runtime: &Runtime, path: &Path, threads: usize) -> Result<Self, InferError> {
-        let wrong = |message: String| InferError::Model { path: path.to_owned(), message };
+        let wrong = |message: String| InferError::Model {
+            path: path.to_owned(),
+            message,
+        };
         if !path.is_file() {
-            return Err(wrong("no such file\n  cure: `barchan export RUN --out x.onnx` writes one".into()));
+            return Err(wrong(
+                "no such file\n  cure: `barchan export RUN --out x.onnx` writes one".into(),
+            ));
         }
         let cure = "cure: give a file that `barchan export` wrote";
         let session = Session::builder(&runtime.environment)
@@ -107,12 +121,19 @@ impl OnnxEngine {
             .map_err(|e| wrong(format!("not a usable ONNX file: {e}\n  {cure}")))?;
         let inputs: Vec<&str> = session.inputs().iter().map(|i| i.name()).collect();
         let outputs: Vec<&str> = session.outputs().iter().map(|o| o.name()).collect();
-        if inputs != ["left", "right"] || !["disparity", "confidence", "sigma"].iter().all(|o| outputs.contains(o)) {
+        if inputs != ["left", "right"]
+            || !["disparity", "confidence", "sigma"]
+                .iter()
+                .all(|o| outputs.contains(o))
+        {
             return Err(wrong(format!(
                 "inputs {inputs:?} and outputs {outputs:?}; expected left, right and disparity, confidence, sigma\n  {cure}"
             )));
         }
-        Ok(Self { session, path: path.to_owned() })
+        Ok(Self {
+            session,
+            path: path.to_owned(),
+        })
     }
 }
 
@@ -124,15 +145,26 @@ impl DisparityEngine for OnnxEngine {
     fn disparity(&mut self, left: &Rgb, right: &Rgb) -> Result<DisparityMap, InferError> {
         check_sizes(left, right)?;
         let engine = self.name();
-        let failed = |message: String| InferError::Failed { engine: engine.clone(), message };
+        let failed = |message: String| InferError::Failed {
+            engine: engine.clone(),
+            message,
+        };
         let size = [left.width() as usize, left.height() as usize];
         let shape = [1, 3, size[1], size[0]];
         let pixels = [left, right].map(|image| planar(image, [0, 0], size));
-        let tensor = |data| TensorRef::from_array_view((shape, data)).map_err(|e| failed(e.to_string()));
-        let inputs = ort::inputs! { "left" => tensor(&pixels[0][..])?, "right" => tensor(&pixels[1][..])? };
-        let outputs = self.session.run(inputs).map_err(|e| failed(e.to_string()))?;
+        let tensor =
+            |data| TensorRef::from_array_view((shape, data)).map_err(|e| failed(e.to_string()));
+        let inputs =
+            ort::inputs! { "left" => tensor(&pixels[0][..])?, "right" => tensor(&pixels[1][..])? };
+        let outputs = self
+            .session
+            .run(inputs)
+            .map_err(|e| failed(e.to_string()))?;
         let read = |name: &str| {
-            outputs[name].try_extract_tensor::<f32>().map(|(_, data)| data.to_vec()).map_err(|e| failed(e.to_string()))
+            outputs[name]
+                .try_extract_tensor::<f32>()
+                .map(|(_, data)| data.to_vec())
+                .map_err(|e| failed(e.to_string()))
         };
         let maps = [read("disparity")?, read("sigma")?, read("confidence")?];
         DisparityMap::from_network(&engine, left.dimensions(), maps)

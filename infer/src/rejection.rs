@@ -18,7 +18,9 @@ pub struct Rejection {
 
 impl Default for Rejection {
     fn default() -> Self {
-        Self { max_dissimilarity: 0.4 }
+        Self {
+            max_dissimilarity: 0.4,
+        }
     }
 }
 
@@ -43,18 +45,21 @@ pub fn warp_right_to_left(right: &Plane, disparity: &Plane) -> Plane {
     let (width, height) = disparity.dimensions();
     let (w, source) = (width as usize, right.as_raw());
     let mut warped = vec![f32::NAN; w * height as usize];
-    warped.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
-        for (x, out) in row.iter_mut().enumerate() {
-            let at = x as f32 - disparity.as_raw()[y * w + x];
-            if !(at >= 0.0 && at <= (w - 1) as f32) {
-                continue;
+    warped
+        .par_chunks_mut(w.max(1))
+        .enumerate()
+        .for_each(|(y, row)| {
+            for (x, out) in row.iter_mut().enumerate() {
+                let at = x as f32 - disparity.as_raw()[y * w + x];
+                if !(at >= 0.0 && at <= (w - 1) as f32) {
+                    continue;
+                }
+                let x0 = at as usize;
+                let a = at - x0 as f32;
+                let next = source[y * w + (x0 + 1).min(w - 1)];
+                *out = (1.0 - a) * source[y * w + x0] + a * next;
             }
-            let x0 = at as usize;
-            let a = at - x0 as f32;
-            let next = source[y * w + (x0 + 1).min(w - 1)];
-            *out = (1.0 - a) * source[y * w + x0] + a * next;
-        }
-    });
+        });
     // One value a pixel by construction.
     Plane::from_raw(width, height, warped).unwrap_or_default()
 }
@@ -70,39 +75,44 @@ pub fn structural_dissimilarity(a: &Plane, b: &Plane) -> Plane {
     let (w, h) = (width as usize, height as usize);
     let (pa, pb) = (a.as_raw(), b.as_raw());
     let mut out = vec![f32::NAN; w * h];
-    out.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
-        // Sums over the window's rows, one set per column; the window then slides along x.
-        let columns: Vec<[f32; 6]> = (0..w)
-            .map(|x| {
-                let mut s = [0.0; 6];
-                for yy in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(h) {
-                    let (va, vb) = (pa[yy * w + x], pb[yy * w + x]);
-                    if va.is_finite() && vb.is_finite() {
-                        for (sum, term) in s.iter_mut().zip([1.0, va, vb, va * va, vb * vb, va * vb]) {
-                            *sum += term;
+    out.par_chunks_mut(w.max(1))
+        .enumerate()
+        .for_each(|(y, row)| {
+            // Sums over the window's rows, one set per column; the window then slides along x.
+            let columns: Vec<[f32; 6]> = (0..w)
+                .map(|x| {
+                    let mut s = [0.0; 6];
+                    for yy in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(h) {
+                        let (va, vb) = (pa[yy * w + x], pb[yy * w + x]);
+                        if va.is_finite() && vb.is_finite() {
+                            for (sum, term) in
+                                s.iter_mut().zip([1.0, va, vb, va * va, vb * vb, va * vb])
+                            {
+                                *sum += term;
+                            }
                         }
                     }
+                    s
+                })
+                .collect();
+            for x in 0..w {
+                if !(pa[y * w + x].is_finite() && pb[y * w + x].is_finite()) {
+                    continue;
                 }
-                s
-            })
-            .collect();
-        for x in 0..w {
-            if !(pa[y * w + x].is_finite() && pb[y * w + x].is_finite()) {
-                continue;
-            }
-            let mut s = [0.0; 6];
-            for column in &columns[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(w)] {
-                for (sum, term) in s.iter_mut().zip(column) {
-                    *sum += term;
+                let mut s = [0.0; 6];
+                for column in &columns[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(w)] {
+                    for (sum, term) in s.iter_mut().zip(column) {
+                        *sum += term;
+                    }
                 }
+                let n = s[0];
+                let (ma, mb) = (s[1] / n, s[2] / n);
+                let (va, vb) = ((s[3] / n - ma * ma).max(0.0), (s[4] / n - mb * mb).max(0.0));
+                let cov = s[5] / n - ma * mb;
+                let ssim = ((2.0 * ma * mb + C1) * (2.0 * cov + C2))
+                    / ((ma * ma + mb * mb + C1) * (va + vb + C2));
+                row[x] = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
             }
-            let n = s[0];
-            let (ma, mb) = (s[1] / n, s[2] / n);
-            let (va, vb) = ((s[3] / n - ma * ma).max(0.0), (s[4] / n - mb * mb).max(0.0));
-            let cov = s[5] / n - ma * mb;
-            let ssim = ((2.0 * ma * mb + C1) * (2.0 * cov + C2)) / ((ma * ma + mb * mb + C1) * (va + vb + C2));
-            row[x] = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
-        }
-    });
+        });
     Plane::from_raw(width, height, out).unwrap_or_default()
 }

@@ -33,20 +33,27 @@ fn conv(channels: [usize; 2], stride: usize, device: &Device) -> Conv3d {
     Conv3dConfig::new(channels, [3; 3])
         .with_stride([stride; 3])
         .with_padding(PaddingConfig3d::Explicit(1, 1, 1))
-        .with_initializer(Initializer::KaimingNormal { gain: std::f64::consts::SQRT_2, fan_out_only: false })
+        .with_initializer(Initializer::KaimingNormal {
+            gain: std::f64::consts::SQRT_2,
+            fan_out_only: false,
+        })
         .init(device)
 }
 
 /// Doubles disparities, height and width exactly.
 fn up(channels: [usize; 2], device: &Device) -> ConvTranspose3d {
-    ConvTranspose3dConfig::new(channels, [4; 3]).with_stride([2; 3]).with_padding([1; 3]).init(device)
+    ConvTranspose3dConfig::new(channels, [4; 3])
+        .with_stride([2; 3])
+        .with_padding([1; 3])
+        .init(device)
 }
 
 impl Aggregation {
     /// `channels` at 1/4, 1/8 and 1/16; `input` channels, the last two being the census's.
     pub fn init(input: usize, [quarter, eighth, sixteenth]: [usize; 3], device: &Device) -> Self {
-        let mut matching =
-            Conv3dConfig::new([input, 1], [3, 1, 1]).with_padding(PaddingConfig3d::Explicit(1, 0, 0)).init(device);
+        let mut matching = Conv3dConfig::new([input, 1], [3, 1, 1])
+            .with_padding(PaddingConfig3d::Explicit(1, 0, 0))
+            .init(device);
         matching.weight = Param::from_data(census_matching(input), device);
         Self {
             quarter: conv([input, quarter], 1, device),
@@ -58,7 +65,10 @@ impl Aggregation {
             up_quarter: up([eighth, quarter], device),
             // Small, so that the matching convolution speaks first.
             out: Conv3dConfig::new([quarter, 1], [1; 3])
-                .with_initializer(Initializer::KaimingNormal { gain: 0.1, fan_out_only: false })
+                .with_initializer(Initializer::KaimingNormal {
+                    gain: 0.1,
+                    fan_out_only: false,
+                })
                 .init(device),
             matching,
         }

@@ -12,7 +12,10 @@ pub(crate) fn conv3x3(channels: [usize; 2], stride: usize, device: &Device) -> C
     Conv2dConfig::new(channels, [3, 3])
         .with_stride([stride, stride])
         .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
-        .with_initializer(Initializer::KaimingNormal { gain: std::f64::consts::SQRT_2, fan_out_only: false })
+        .with_initializer(Initializer::KaimingNormal {
+            gain: std::f64::consts::SQRT_2,
+            fan_out_only: false,
+        })
         .init(device)
 }
 
@@ -72,7 +75,10 @@ impl Features {
         let context = ops.add(&quarter, &up);
         let context = ops.relu(&context);
         let matching = ops.conv2d(&format!("{scope}.matching"), &self.matching, &context);
-        FeatureMaps { matching: unit_length(ops, scope, &matching, self.matching.weight.dims()[0]), context }
+        FeatureMaps {
+            matching: unit_length(ops, scope, &matching, self.matching.weight.dims()[0]),
+            context,
+        }
     }
 }
 

@@ -2,12 +2,12 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
+use crate::ModelError;
 use crate::aggregation::Aggregation;
 use crate::features::Features;
 use crate::ops::{Execute, Ops};
 use crate::regression::{Regression, SCALE};
 use crate::volume::{CENSUS_CHANNELS, census_volume, correlation_volume};
-use crate::ModelError;
 
 /// Images are padded inside the network to a multiple of this.
 const MULTIPLE: usize = 16;
@@ -25,7 +25,7 @@ impl Preset {
     pub fn config(self) -> NetConfig {
         match self {
             Self::Tiny => NetConfig {
-                max_disparity: 64,
+                max_disparity: 96,
                 features: [16, 24, 40],
                 matching: 16,
                 groups: 4,
@@ -61,10 +61,18 @@ impl NetConfig {
     /// Says which field and what it should be.
     pub fn check(&self) -> Result<(), ModelError> {
         let refuse = |message: &str| Err(ModelError::Config(message.into()));
-        if self.max_disparity == 0 || self.max_disparity % (4 * SCALE) != 0 || self.max_disparity > 1024 {
+        if self.max_disparity == 0
+            || self.max_disparity % (4 * SCALE) != 0
+            || self.max_disparity > 1024
+        {
             return refuse("max_disparity must be a multiple of 16, at most 1024");
         }
-        let channels = [&self.features[..], &self.aggregation[..], &[self.matching, self.groups, self.up_sampling]].concat();
+        let channels = [
+            &self.features[..],
+            &self.aggregation[..],
+            &[self.matching, self.groups, self.up_sampling],
+        ]
+        .concat();
         if channels.iter().any(|c| !(1..=1024).contains(c)) {
             return refuse("channels and groups must be 1 to 1024");
         }
@@ -141,7 +149,9 @@ impl StereoNet {
 
     /// The definition, for whoever interprets it.
     pub fn run<O: Ops>(&self, ops: &mut O, left: &O::Map, right: &O::Map) -> Prediction<O::Map> {
-        let NetConfig { matching, groups, .. } = self.config;
+        let NetConfig {
+            matching, groups, ..
+        } = self.config;
         let bins = self.config.bins();
 
         // Colour cast and exposure, of each camera on its own, go before anything is compared.
@@ -154,12 +164,21 @@ impl StereoNet {
         let seen_left = self.features.forward(ops, "features", &l);
         let seen_right = self.features.forward(ops, "features", &r);
 
-        let correlation = correlation_volume(ops, &seen_left.matching, &seen_right.matching, matching, groups, bins);
+        let correlation = correlation_volume(
+            ops,
+            &seen_left.matching,
+            &seen_right.matching,
+            matching,
+            groups,
+            bins,
+        );
         let census = census_volume(ops, &l, &r, bins);
         let volume = ops.concat_volumes(&[correlation, census]);
 
         let logits = self.aggregation.forward(ops, &volume);
-        let full = self.regression.forward(ops, bins, &logits, &seen_left.context);
+        let full = self
+            .regression
+            .forward(ops, bins, &logits, &seen_left.context);
         Prediction {
             disparity: ops.crop_to(left, &full.disparity),
             sigma: ops.crop_to(left, &full.sigma),

@@ -47,13 +47,25 @@ pub trait Ops {
     /// A learned convolution.
     fn conv2d(&mut self, name: &str, layer: &Conv2d, x: &Self::Map) -> Self::Map;
     /// A learned transposed convolution.
-    fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &Self::Map) -> Self::Map;
+    fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &Self::Map)
+    -> Self::Map;
     /// A learned convolution over disparity, height and width.
     fn conv3d(&mut self, name: &str, layer: &Conv3d, x: &Self::Volume) -> Self::Volume;
     /// A learned transposed convolution over disparity, height and width.
-    fn conv_transpose3d(&mut self, name: &str, layer: &ConvTranspose3d, x: &Self::Volume) -> Self::Volume;
+    fn conv_transpose3d(
+        &mut self,
+        name: &str,
+        layer: &ConvTranspose3d,
+        x: &Self::Volume,
+    ) -> Self::Volume;
     /// A convolution with a given kernel, without padding.
-    fn fixed_conv2d(&mut self, name: &str, kernel: &Kernel, stride: usize, x: &Self::Map) -> Self::Map;
+    fn fixed_conv2d(
+        &mut self,
+        name: &str,
+        kernel: &Kernel,
+        stride: usize,
+        x: &Self::Map,
+    ) -> Self::Map;
 
     /// `max(x, 0)`.
     fn relu(&mut self, x: &Self::Map) -> Self::Map;
@@ -134,9 +146,23 @@ impl Ops for Execute {
     fn conv_transpose3d(&mut self, _: &str, layer: &ConvTranspose3d, x: &Tensor<5>) -> Tensor<5> {
         layer.forward(x.clone())
     }
-    fn fixed_conv2d(&mut self, _: &str, kernel: &Kernel, stride: usize, x: &Tensor<4>) -> Tensor<4> {
-        let weight = Tensor::<4>::from_data(TensorData::new(kernel.data.clone(), kernel.shape), &self.device);
-        conv2d(x.clone(), weight, None, ConvOptions::new([stride; 2], [0; 2], [1; 2], 1))
+    fn fixed_conv2d(
+        &mut self,
+        _: &str,
+        kernel: &Kernel,
+        stride: usize,
+        x: &Tensor<4>,
+    ) -> Tensor<4> {
+        let weight = Tensor::<4>::from_data(
+            TensorData::new(kernel.data.clone(), kernel.shape),
+            &self.device,
+        );
+        conv2d(
+            x.clone(),
+            weight,
+            None,
+            ConvOptions::new([stride; 2], [0; 2], [1; 2], 1),
+        )
     }
 
     fn relu(&mut self, x: &Tensor<4>) -> Tensor<4> {
@@ -181,7 +207,10 @@ impl Ops for Execute {
         softmax(x.clone(), 1)
     }
     fn channel_constant(&mut self, _: &str, values: &[f32]) -> Tensor<4> {
-        Tensor::from_data(TensorData::new(values.to_vec(), [1, values.len(), 1, 1]), &self.device)
+        Tensor::from_data(
+            TensorData::new(values.to_vec(), [1, values.len(), 1, 1]),
+            &self.device,
+        )
     }
     fn add_volume(&mut self, a: &Tensor<5>, b: &Tensor<5>) -> Tensor<5> {
         a.clone() + b.clone()
@@ -205,7 +234,9 @@ impl Ops for Execute {
         }
         let width = x.dims()[3];
         let by = by.min(width);
-        x.clone().narrow(3, 0, width - by).pad((by, 0, 0, 0), PadMode::Constant(0.0))
+        x.clone()
+            .narrow(3, 0, width - by)
+            .pad((by, 0, 0, 0), PadMode::Constant(0.0))
     }
     fn pad_edge(&mut self, by: usize, x: &Tensor<4>) -> Tensor<4> {
         x.clone().pad((by, by, by, by), PadMode::Edge)

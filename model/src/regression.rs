@@ -32,7 +32,13 @@ impl Regression {
 
     /// Disparity, standard deviation (pixels) and confidence at full resolution `[B, 1, 4h, 4w]`
     /// from logits `[B, bins, h, w]`.
-    pub fn forward<O: Ops>(&self, ops: &mut O, bins: usize, logits: &O::Map, context: &O::Map) -> Prediction<O::Map> {
+    pub fn forward<O: Ops>(
+        &self,
+        ops: &mut O,
+        bins: usize,
+        logits: &O::Map,
+        context: &O::Map,
+    ) -> Prediction<O::Map> {
         let probability = ops.softmax(logits);
         let mean = self.expectation(ops, "mean", bins, &probability, |k| k);
         let square = self.expectation(ops, "square", bins, &probability, |k| k * k);
@@ -44,14 +50,21 @@ impl Regression {
         // exp over its sum is a softmax without a reduction over a strided axis; the clamp keeps it finite.
         let logits = ops.clamp(-12.0, 12.0, &logits);
         let weights = ops.exp(&logits);
-        let sum = Kernel::from_fn([SUBPIXELS, NEIGHBOURS * SUBPIXELS, 1, 1], |s, c, _, _| f32::from(c % SUBPIXELS == s));
+        let sum = Kernel::from_fn([SUBPIXELS, NEIGHBOURS * SUBPIXELS, 1, 1], |s, c, _, _| {
+            f32::from(c % SUBPIXELS == s)
+        });
         let total = ops.fixed_conv2d("regression.total", &sum, 1, &weights);
         let neighbours = Kernel::from_fn([NEIGHBOURS * SUBPIXELS, 1, 3, 3], |c, _, y, x| {
             f32::from(c / SUBPIXELS == 3 * y + x)
         });
         let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
             let padded = ops.pad_edge(1, x);
-            let around = ops.fixed_conv2d(&format!("regression.{name}.around"), &neighbours, 1, &padded);
+            let around = ops.fixed_conv2d(
+                &format!("regression.{name}.around"),
+                &neighbours,
+                1,
+                &padded,
+            );
             let weighted = ops.mul(&weights, &around);
             let mixed = ops.fixed_conv2d(&format!("regression.{name}.mix"), &sum, 1, &weighted);
             let mixed = ops.div(&mixed, &total);
@@ -74,7 +87,14 @@ impl Regression {
         }
     }
 
-    fn expectation<O: Ops>(&self, ops: &mut O, name: &str, bins: usize, p: &O::Map, value: impl Fn(f32) -> f32) -> O::Map {
+    fn expectation<O: Ops>(
+        &self,
+        ops: &mut O,
+        name: &str,
+        bins: usize,
+        p: &O::Map,
+        value: impl Fn(f32) -> f32,
+    ) -> O::Map {
         let kernel = Kernel::from_fn([1, bins, 1, 1], |_, k, _, _| value(k as f32));
         ops.fixed_conv2d(&format!("regression.{name}"), &kernel, 1, p)
     }

@@ -24,7 +24,9 @@ pub fn correlation_volume<O: Ops>(
     bins: usize,
 ) -> O::Volume {
     let per_group = channels / groups;
-    let group_sum = Kernel::from_fn([groups, channels, 1, 1], |g, c, _, _| f32::from(c / per_group == g));
+    let group_sum = Kernel::from_fn([groups, channels, 1, 1], |g, c, _, _| {
+        f32::from(c / per_group == g)
+    });
     let planes: Vec<O::Map> = (0..bins)
         .map(|d| {
             let shifted = ops.shift_right(d, right);
@@ -50,7 +52,14 @@ pub fn census_volume<O: Ops>(ops: &mut O, left: &O::Map, right: &O::Map, bins: u
             ops.fixed_conv2d(&format!("census.{half_d}.window"), &window, 2, &padded)
         })
         .collect();
-    let half = |odd: usize| planes.iter().skip(odd).step_by(2).cloned().collect::<Vec<_>>();
+    let half = |odd: usize| {
+        planes
+            .iter()
+            .skip(odd)
+            .step_by(2)
+            .cloned()
+            .collect::<Vec<_>>()
+    };
     let (whole_bins, half_bins) = (ops.stack(&half(0)), ops.stack(&half(1)));
     ops.concat_volumes(&[whole_bins, half_bins])
 }

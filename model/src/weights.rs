@@ -20,16 +20,24 @@ const CONFIG_KEY: &str = "barchan.config";
 /// # Errors
 /// When the tensors cannot be read back from their device.
 pub fn to_bytes(net: &StereoNet) -> Result<Vec<u8>, ModelError> {
-    let failed = |message: String| ModelError::Weights { path: "weights".into(), message };
+    let failed = |message: String| ModelError::Weights {
+        path: "weights".into(),
+        message,
+    };
     let mut collect = Collect::default();
     net.visit(&mut collect);
     let mut tensors = Vec::with_capacity(collect.tensors.len());
     for (name, (shape, values)) in &collect.tensors {
-        let view = TensorView::new(Dtype::F32, shape.clone(), values).map_err(|e| failed(e.to_string()))?;
+        let view = TensorView::new(Dtype::F32, shape.clone(), values)
+            .map_err(|e| failed(e.to_string()))?;
         tensors.push((name.as_str(), view));
     }
     let config = serde_json::to_string(net.config()).map_err(|e| failed(e.to_string()))?;
-    serialize(tensors, Some(HashMap::from([(CONFIG_KEY.to_owned(), config)]))).map_err(|e| failed(e.to_string()))
+    serialize(
+        tensors,
+        Some(HashMap::from([(CONFIG_KEY.to_owned(), config)])),
+    )
+    .map_err(|e| failed(e.to_string()))
 }
 
 /// Writes a safetensors file, all or nothing.
@@ -45,7 +53,10 @@ pub fn save(net: &StereoNet, path: &Path) -> Result<(), ModelError> {
 /// # Errors
 /// When the file is missing, is not safetensors, or lacks the configuration or a layer.
 pub fn load(path: &Path, device: &Device) -> Result<StereoNet, ModelError> {
-    let bytes = std::fs::read(path).map_err(|source| ModelError::Io { path: path.to_owned(), source })?;
+    let bytes = std::fs::read(path).map_err(|source| ModelError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
     from_bytes(&bytes, path, device)
 }
 
@@ -54,8 +65,15 @@ pub fn load(path: &Path, device: &Device) -> Result<StereoNet, ModelError> {
 /// # Errors
 /// As [`load`].
 pub fn from_bytes(bytes: &[u8], name: &Path, device: &Device) -> Result<StereoNet, ModelError> {
-    let wrong = |message: String| ModelError::Weights { path: name.to_owned(), message };
-    let not_ours = |e: String| wrong(format!("not weights of barchan ({e})\n  cure: give a file that `barchan train` wrote"));
+    let wrong = |message: String| ModelError::Weights {
+        path: name.to_owned(),
+        message,
+    };
+    let not_ours = |e: String| {
+        wrong(format!(
+            "not weights of barchan ({e})\n  cure: give a file that `barchan train` wrote"
+        ))
+    };
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| not_ours(e.to_string()))?;
     let file = SafeTensors::deserialize(bytes).map_err(|e| not_ours(e.to_string()))?;
     let config = metadata
@@ -70,15 +88,27 @@ pub fn from_bytes(bytes: &[u8], name: &Path, device: &Device) -> Result<StereoNe
         if view.dtype() != Dtype::F32 {
             return Err(wrong(format!("{name} is {:?}, expected F32", view.dtype())));
         }
-        let values: Vec<f32> = view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        let values: Vec<f32> = view
+            .data()
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|b| f32::from_le_bytes(*b))
+            .collect();
         tensors.insert(name, TensorData::new(values, view.shape().to_vec()));
     }
-    let mut apply = Apply { path: vec![], tensors, problem: None };
+    let mut apply = Apply {
+        path: vec![],
+        tensors,
+        problem: None,
+    };
     // The seed is of no account: every parameter is replaced.
     let net = StereoNet::init(&config, 0, device)?.map(&mut apply);
     match (apply.problem, apply.tensors.keys().next()) {
         (Some(problem), _) => Err(wrong(problem)),
-        (None, Some(unused)) => Err(wrong(format!("{unused} belongs to no layer of this network"))),
+        (None, Some(unused)) => Err(wrong(format!(
+            "{unused} belongs to no layer of this network"
+        ))),
         (None, None) => Ok(net),
     }
 }
@@ -88,7 +118,10 @@ pub fn from_bytes(bytes: &[u8], name: &Path, device: &Device) -> Result<StereoNe
 /// # Errors
 /// When either step fails.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
-    let failed = |source| ModelError::Io { path: path.to_owned(), source };
+    let failed = |source| ModelError::Io {
+        path: path.to_owned(),
+        source,
+    };
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     std::fs::write(&part, bytes).map_err(failed)?;
@@ -112,7 +145,8 @@ impl ModuleVisitor for Collect {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         let data = param.val().into_data();
         let bytes = data.iter::<f32>().flat_map(f32::to_le_bytes).collect();
-        self.tensors.insert(self.path.join("."), (param.val().dims().to_vec(), bytes));
+        self.tensors
+            .insert(self.path.join("."), (param.val().dims().to_vec(), bytes));
     }
 }
 
@@ -139,7 +173,10 @@ impl ModuleMapper for Apply {
                 param.transform_for_load(Tensor::from_data(data, &device), id)
             }
             Some(data) => {
-                self.problem = Some(format!("{name} has shape {:?}, expected {expected:?}", data.shape()));
+                self.problem = Some(format!(
+                    "{name} has shape {:?}, expected {expected:?}",
+                    data.shape()
+                ));
                 param
             }
             None => {

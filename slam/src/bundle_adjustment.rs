@@ -1,7 +1,9 @@
 //! Poses and points together: sparse bundle adjustment by the Schur complement (Triggs 2000).
 
 use barchan_geometry::{RectifiedRig, Se3, se3};
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
+use nalgebra::{
+    DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Matrix6x3, Point3, Vector3, Vector6,
+};
 
 use crate::pose::{HUBER, Observation, huber_cost, huber_weight, reprojection_jacobian};
 
@@ -48,7 +50,9 @@ impl BundleAdjustment {
         let (mut current, mut lambda, mut iterations) = (before, 1e-4, 0);
         while iterations < max_iterations {
             iterations += 1;
-            let Some((pose_steps, point_steps)) = self.step(rig, &free, unknown_poses, &by_point, lambda) else {
+            let Some((pose_steps, point_steps)) =
+                self.step(rig, &free, unknown_poses, &by_point, lambda)
+            else {
                 lambda *= 10.0;
                 continue;
             };
@@ -76,20 +80,28 @@ impl BundleAdjustment {
                 }
             }
         }
-        Summary { before, after: current, iterations }
+        Summary {
+            before,
+            after: current,
+            iterations,
+        }
     }
 
     /// Squared residual of each observation in standard deviations; infinite behind the camera.
     pub fn squared_residuals(&self, rig: &RectifiedRig) -> Vec<f64> {
         let squared = |(pose, point, o): &(usize, usize, Observation)| {
             let p_cam = self.T_cam_world[*pose] * self.points[*point];
-            o.residual(rig, &p_cam).map_or(f64::INFINITY, |r| r.norm_squared())
+            o.residual(rig, &p_cam)
+                .map_or(f64::INFINITY, |r| r.norm_squared())
         };
         self.observations.iter().map(squared).collect()
     }
 
     fn cost(&self, rig: &RectifiedRig) -> f64 {
-        self.squared_residuals(rig).into_iter().map(|s| huber_cost(s.min(1e6), HUBER)).sum()
+        self.squared_residuals(rig)
+            .into_iter()
+            .map(|s| huber_cost(s.min(1e6), HUBER))
+            .sum()
     }
 
     fn observations_by_point(&self) -> Vec<Vec<usize>> {
@@ -122,10 +134,16 @@ impl BundleAdjustment {
             for i in sightings {
                 let (pose, _, o) = &self.observations[*i];
                 let p_cam = self.T_cam_world[*pose] * self.points[point];
-                let Some(residual) = o.residual(rig, &p_cam) else { continue };
+                let Some(residual) = o.residual(rig, &p_cam) else {
+                    continue;
+                };
                 let weight = huber_weight(residual.norm_squared(), HUBER);
                 let projection = o.mask(rig.projection_jacobian(&p_cam)) / o.sigma;
-                let by_position: Matrix3<f64> = projection * self.T_cam_world[*pose].rotation.to_rotation_matrix().matrix();
+                let by_position: Matrix3<f64> = projection
+                    * self.T_cam_world[*pose]
+                        .rotation
+                        .to_rotation_matrix()
+                        .matrix();
                 h_points += by_position.transpose() * by_position * weight;
                 g_point += by_position.transpose() * residual * weight;
                 if let Some(slot) = free[*pose] {
@@ -142,8 +160,13 @@ impl BundleAdjustment {
                     coupled.push((slot, by_pose.transpose() * by_position * weight));
                 }
             }
-            let damped = h_points + Matrix3::from_diagonal(&(h_points.diagonal() * lambda).add_scalar(1e-9));
-            eliminated.push(damped.try_inverse().map(|inverse| (inverse, g_point, coupled)));
+            let damped =
+                h_points + Matrix3::from_diagonal(&(h_points.diagonal() * lambda).add_scalar(1e-9));
+            eliminated.push(
+                damped
+                    .try_inverse()
+                    .map(|inverse| (inverse, g_point, coupled)),
+            );
         }
         for k in 0..n {
             reduced[(k, k)] += lambda * reduced[(k, k)] + 1e-9;
@@ -159,15 +182,25 @@ impl BundleAdjustment {
                 }
             }
         }
-        let solved = if n == 0 { right } else { reduced.cholesky()?.solve(&right) };
-        let pose_steps: Vec<Vector6<f64>> = (0..unknown_poses).map(|k| solved.fixed_rows::<6>(6 * k).into_owned()).collect();
+        let solved = if n == 0 {
+            right
+        } else {
+            reduced.cholesky()?.solve(&right)
+        };
+        let pose_steps: Vec<Vector6<f64>> = (0..unknown_poses)
+            .map(|k| solved.fixed_rows::<6>(6 * k).into_owned())
+            .collect();
         let point_steps = eliminated
             .iter()
             .map(|e| {
-                e.as_ref().map_or_else(Vector3::zeros, |(inverse, g_point, coupled)| {
-                    let pulled: Vector3<f64> = coupled.iter().map(|(slot, w)| w.transpose() * pose_steps[*slot]).sum();
-                    inverse * (g_point - pulled)
-                })
+                e.as_ref()
+                    .map_or_else(Vector3::zeros, |(inverse, g_point, coupled)| {
+                        let pulled: Vector3<f64> = coupled
+                            .iter()
+                            .map(|(slot, w)| w.transpose() * pose_steps[*slot])
+                            .sum();
+                        inverse * (g_point - pulled)
+                    })
             })
             .collect();
         Some((pose_steps, point_steps))
@@ -183,24 +216,56 @@ mod tests {
 
     /// Six cameras along a path, all points seen by all that have them in view; no noise.
     fn problem() -> BundleAdjustment {
-        let poses: Vec<Se3> =
-            (0..6).map(|i| se3::exp(&Vector6::new(0.05 * i as f64, 0.0, -0.08 * i as f64, 0.0, 0.02 * i as f64, 0.0))).collect();
+        let poses: Vec<Se3> = (0..6)
+            .map(|i| {
+                se3::exp(&Vector6::new(
+                    0.05 * i as f64,
+                    0.0,
+                    -0.08 * i as f64,
+                    0.0,
+                    0.02 * i as f64,
+                    0.0,
+                ))
+            })
+            .collect();
         let points: Vec<Point3<f64>> = world(&poses[2], 120, 5).iter().map(|o| o.point).collect();
         let mut observations = Vec::new();
         for (i, pose) in poses.iter().enumerate() {
             for (j, point) in points.iter().enumerate() {
-                if let Some(s) = rig().project(&(pose * point)).filter(|s| s.u > 0.0 && s.u < 511.0 && s.v > 0.0 && s.v < 287.0) {
+                if let Some(s) = rig()
+                    .project(&(pose * point))
+                    .filter(|s| s.u > 0.0 && s.u < 511.0 && s.v > 0.0 && s.v < 287.0)
+                {
                     let d = (j % 4 != 0).then_some(s.d);
-                    observations.push((i, j, Observation { point: *point, u: s.u, v: s.v, d, sigma: 1.0 }));
+                    observations.push((
+                        i,
+                        j,
+                        Observation {
+                            point: *point,
+                            u: s.u,
+                            v: s.v,
+                            d,
+                            sigma: 1.0,
+                        },
+                    ));
                 }
             }
         }
         let fixed = (0..6).map(|i| i == 0).collect();
-        BundleAdjustment { T_cam_world: poses, fixed, points, observations }
+        BundleAdjustment {
+            T_cam_world: poses,
+            fixed,
+            points,
+            observations,
+        }
     }
 
     fn distance(a: &BundleAdjustment, b: &BundleAdjustment) -> f64 {
-        let poses = a.T_cam_world.iter().zip(&b.T_cam_world).map(|(p, q)| se3::log(&(p.inverse() * q)).norm());
+        let poses = a
+            .T_cam_world
+            .iter()
+            .zip(&b.T_cam_world)
+            .map(|(p, q)| se3::log(&(p.inverse() * q)).norm());
         let points = a.points.iter().zip(&b.points).map(|(p, q)| (p - q).norm());
         poses.chain(points).fold(0.0, f64::max)
     }
@@ -227,7 +292,11 @@ mod tests {
         }
         let summary = disturbed.solve(&rig(), 40);
         assert!(summary.after < 1e-3 * summary.before, "{summary:?}");
-        assert!(distance(&disturbed, &truth) < 1e-3, "{}", distance(&disturbed, &truth));
+        assert!(
+            distance(&disturbed, &truth) < 1e-3,
+            "{}",
+            distance(&disturbed, &truth)
+        );
         // Fixed poses do not move at all.
         assert_eq!(disturbed.T_cam_world[0], truth.T_cam_world[0]);
 
@@ -240,7 +309,9 @@ mod tests {
         }
         spoiled.solve(&rig(), 40);
         let poses = spoiled.T_cam_world.iter().zip(&truth.T_cam_world);
-        let worst = poses.map(|(p, q)| se3::log(&(p.inverse() * q)).norm()).fold(0.0, f64::max);
+        let worst = poses
+            .map(|(p, q)| se3::log(&(p.inverse() * q)).norm())
+            .fold(0.0, f64::max);
         assert!(worst < 0.02, "{worst}");
     }
 }

@@ -60,16 +60,32 @@ impl Orb {
     /// # Errors
     /// What the detector says, when the image is too small for it.
     pub fn extract(&self, grey: &Plane) -> Result<Features, String> {
-        let bytes = grey.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        let size = ImageSize { width: grey.width() as usize, height: grey.height() as usize };
+        let bytes = grey
+            .iter()
+            .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)
+            .collect();
+        let size = ImageSize {
+            width: grey.width() as usize,
+            height: grey.height() as usize,
+        };
         let image = Image::<u8, 1>::new(size, bytes).map_err(|e| e.to_string())?;
-        let found = self.detector.detect_and_extract_u8(&image).map_err(|e| e.to_string())?;
+        let found = self
+            .detector
+            .detect_and_extract_u8(&image)
+            .map_err(|e| e.to_string())?;
         let keypoints = found
             .keypoints_xy
             .iter()
             .zip(&found.octaves)
-            .map(|(xy, octave)| Keypoint { u: f64::from(xy[0]), v: f64::from(xy[1]), octave: *octave })
+            .map(|(xy, octave)| Keypoint {
+                u: f64::from(xy[0]),
+                v: f64::from(xy[1]),
+                octave: *octave,
+            })
             .collect();
-        Ok(Features { keypoints, descriptors: found.descriptors })
+        Ok(Features {
+            keypoints,
+            descriptors: found.descriptors,
+        })
     }
 }

@@ -46,7 +46,9 @@ pub enum SlamError {
         source: barchan_infer::InferError,
     },
     /// A frame has not the size of the rig.
-    #[error("frame {frame}: {width} x {height} pixels, but the rig says {rig_width} x {rig_height}")]
+    #[error(
+        "frame {frame}: {width} x {height} pixels, but the rig says {rig_width} x {rig_height}"
+    )]
     Size {
         /// The frame.
         frame: String,

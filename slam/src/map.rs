@@ -57,7 +57,13 @@ pub struct Map {
 
 impl Map {
     /// Adds a point seen by feature `feature` of key frame `keyframe`.
-    pub fn add_point(&mut self, keyframe: usize, feature: usize, position: Point3<f64>, colour: [u8; 3]) -> PointId {
+    pub fn add_point(
+        &mut self,
+        keyframe: usize,
+        feature: usize,
+        position: Point3<f64>,
+        colour: [u8; 3],
+    ) -> PointId {
         let id = self.next;
         self.next += 1;
         let frame = &mut self.keyframes[keyframe];
@@ -111,7 +117,10 @@ impl Map {
 
     /// Points seen by any of the key frames from `first` on, in order.
     pub fn points_since(&self, first: usize) -> Vec<PointId> {
-        let mut ids: Vec<PointId> = self.keyframes[first.min(self.keyframes.len())..].iter().flat_map(|k| k.points.iter().flatten().copied()).collect();
+        let mut ids: Vec<PointId> = self.keyframes[first.min(self.keyframes.len())..]
+            .iter()
+            .flat_map(|k| k.points.iter().flatten().copied())
+            .collect();
         ids.sort_unstable();
         ids.dedup();
         ids

@@ -11,7 +11,11 @@ pub fn hamming(a: &Descriptor, b: &Descriptor) -> u32 {
     let words = |d: &Descriptor| -> [u64; 4] {
         std::array::from_fn(|i| u64::from_le_bytes(std::array::from_fn(|k| d[8 * i + k])))
     };
-    words(a).iter().zip(words(b)).map(|(x, y)| (x ^ y).count_ones()).sum()
+    words(a)
+        .iter()
+        .zip(words(b))
+        .map(|(x, y)| (x ^ y).count_ones())
+        .sum()
 }
 
 /// How many stereo matches each rule decided (Hong 2021, table 1).
@@ -39,7 +43,9 @@ impl DisparityGate<'_> {
     pub fn agrees(&self, keypoint: &Keypoint, disparity: f64) -> Option<bool> {
         let (u, v) = (keypoint.u.round() as u32, keypoint.v.round() as u32);
         let dense = f64::from(self.disparity.get_pixel_checked(u, v)?.0[0]);
-        dense.is_finite().then(|| (dense - disparity).abs() < self.threshold)
+        dense
+            .is_finite()
+            .then(|| (dense - disparity).abs() < self.threshold)
     }
 }
 
@@ -72,7 +78,12 @@ pub(crate) fn stereo_matches(
             };
             let from = (keypoint.v - reach).max(0.0) as usize;
             let to = ((keypoint.v + reach) as usize + 1).min(rows.len());
-            let candidates = rows.get(from..to)?.iter().flatten().copied().filter(|r| in_reach(&right.keypoints[*r]));
+            let candidates = rows
+                .get(from..to)?
+                .iter()
+                .flatten()
+                .copied()
+                .filter(|r| in_reach(&right.keypoints[*r]));
             let (best, distance, second) = two_nearest(descriptor, candidates, right)?;
             if distance > config.max_hamming {
                 return None;
@@ -112,7 +123,9 @@ fn two_nearest(
     candidates: impl Iterator<Item = usize>,
     features: &Features,
 ) -> Option<(usize, u32, u32)> {
-    let mut all: Vec<(u32, usize)> = candidates.map(|i| (hamming(descriptor, &features.descriptors[i]), i)).collect();
+    let mut all: Vec<(u32, usize)> = candidates
+        .map(|i| (hamming(descriptor, &features.descriptors[i]), i))
+        .collect();
     all.sort_unstable();
     let (distance, best) = *all.first()?;
     let at = features.keypoints[best];
@@ -120,7 +133,10 @@ fn two_nearest(
         let k = features.keypoints[i];
         (k.u - at.u).abs() > 3.0 || (k.v - at.v).abs() > 3.0
     };
-    let second = all.iter().find(|(_, i)| elsewhere(*i)).map_or(256, |(d, _)| *d);
+    let second = all
+        .iter()
+        .find(|(_, i)| elsewhere(*i))
+        .map_or(256, |(d, _)| *d);
     Some((best, distance, second))
 }
 
@@ -183,7 +199,9 @@ pub(crate) fn match_projections(
         let reach = radius * at.sigma().sqrt();
         let near = |i: &usize| {
             let k = features.keypoints[*i];
-            (k.u - at.u).abs() <= reach && (k.v - at.v).abs() <= reach && k.octave.abs_diff(at.octave) <= 2
+            (k.u - at.u).abs() <= reach
+                && (k.v - at.v).abs() <= reach
+                && k.octave.abs_diff(at.octave) <= 2
         };
         let candidates = grid.around(at.u, at.v, reach).filter(near);
         let Some((best, distance, second)) = two_nearest(descriptor, candidates, features) else {
@@ -196,16 +214,26 @@ pub(crate) fn match_projections(
             taken[best] = Some((distance, point));
         }
     }
-    taken.iter().enumerate().filter_map(|(feature, t)| t.map(|(_, point)| (point, feature))).collect()
+    taken
+        .iter()
+        .enumerate()
+        .filter_map(|(feature, t)| t.map(|(_, point)| (point, feature)))
+        .collect()
 }
 
 /// Pairs of two descriptor sets that are nearest to each other and pass the ratio.
-pub(crate) fn match_all(a: &[Descriptor], b: &Features, config: &SlamConfig) -> Vec<(usize, usize)> {
+pub(crate) fn match_all(
+    a: &[Descriptor],
+    b: &Features,
+    config: &SlamConfig,
+) -> Vec<(usize, usize)> {
     let forward: Vec<Option<(usize, u32)>> = a
         .iter()
         .map(|descriptor| {
             let (best, distance, second) = two_nearest(descriptor, 0..b.descriptors.len(), b)?;
-            (distance <= config.max_hamming && f64::from(distance) < config.nndr * f64::from(second)).then_some((best, distance))
+            (distance <= config.max_hamming
+                && f64::from(distance) < config.nndr * f64::from(second))
+            .then_some((best, distance))
         })
         .collect();
     let mut taken: Vec<Option<(u32, usize)>> = vec![None; b.descriptors.len()];
@@ -216,7 +244,11 @@ pub(crate) fn match_all(a: &[Descriptor], b: &Features, config: &SlamConfig) -> 
             taken[*best] = Some((*distance, i));
         }
     }
-    taken.iter().enumerate().filter_map(|(j, t)| t.map(|(_, i)| (i, j))).collect()
+    taken
+        .iter()
+        .enumerate()
+        .filter_map(|(j, t)| t.map(|(_, i)| (i, j)))
+        .collect()
 }
 
 /// Key points by cells of the image, for looking around a place.
@@ -237,7 +269,11 @@ impl Grid {
             let (x, y) = ((k.u / Self::CELL) as usize, (k.v / Self::CELL) as usize);
             cells[y.min(rows - 1) * columns + x.min(columns - 1)].push(i);
         }
-        Self { columns, rows, cells }
+        Self {
+            columns,
+            rows,
+            cells,
+        }
     }
 
     fn around(&self, u: f64, v: f64, reach: f64) -> impl Iterator<Item = usize> + '_ {
@@ -247,7 +283,11 @@ impl Grid {
             from..(to as usize).min(count)
         };
         let columns = range(u, self.columns);
-        range(v, self.rows).flat_map(move |y| columns.clone().flat_map(move |x| self.cells[y * self.columns + x].iter().copied()))
+        range(v, self.rows).flat_map(move |y| {
+            columns
+                .clone()
+                .flat_map(move |x| self.cells[y * self.columns + x].iter().copied())
+        })
     }
 }
 
@@ -268,26 +308,43 @@ mod tests {
     /// A texture and itself moved by a fraction of a pixel.
     fn shifted(by: f64) -> [Plane; 2] {
         let texture = |x: f64, y: f64| {
-            let waves = (0.9 * x + 0.3 * y).sin() + (0.35 * x - 0.8 * y).sin() + (0.21 * x + 0.13 * y).cos();
+            let waves = (0.9 * x + 0.3 * y).sin()
+                + (0.35 * x - 0.8 * y).sin()
+                + (0.21 * x + 0.13 * y).cos();
             (0.5 + 0.15 * waves) as f32
         };
-        [0.0, by].map(|d| Plane::from_fn(80, 40, |x, y| image::Luma([texture(f64::from(x) + d, f64::from(y))])))
+        [0.0, by].map(|d| {
+            Plane::from_fn(80, 40, |x, y| {
+                image::Luma([texture(f64::from(x) + d, f64::from(y))])
+            })
+        })
     }
 
     #[test]
     fn refinement_finds_fractions_of_a_pixel() {
         for true_disparity in [4.0, 5.3, 6.75] {
             let [left, right] = shifted(true_disparity);
-            let at = Keypoint { u: 40.0, v: 20.0, octave: 0 };
+            let at = Keypoint {
+                u: 40.0,
+                v: 20.0,
+                octave: 0,
+            };
             let found = refine_disparity([&left, &right], &at, 5.0).unwrap();
-            assert!((found - true_disparity).abs() < 0.1, "{true_disparity}: {found}");
+            assert!(
+                (found - true_disparity).abs() < 0.1,
+                "{true_disparity}: {found}"
+            );
         }
     }
 
     #[test]
     fn the_gate_admits_the_ambiguous_and_refuses_the_contradicted() {
         let [left, right] = shifted(6.0);
-        let keypoint = |u: f64| Keypoint { u, v: 20.0, octave: 0 };
+        let keypoint = |u: f64| Keypoint {
+            u,
+            v: 20.0,
+            octave: 0,
+        };
         let features = |us: &[f64]| Features {
             keypoints: us.iter().map(|u| keypoint(*u)).collect(),
             descriptors: vec![[7; 32]; us.len()],
@@ -296,8 +353,18 @@ mod tests {
         let dense = |d: f32| Plane::from_pixel(80, 40, image::Luma([d]));
         let run = |right_us: &[f64], gate: Option<f32>| {
             let map = gate.map(dense);
-            let gate = map.as_ref().map(|disparity| DisparityGate { disparity, threshold: 3.0 });
-            stereo_matches(&features(&[40.0]), &features(right_us), [&left, &right], 60.0, gate.as_ref(), &config)
+            let gate = map.as_ref().map(|disparity| DisparityGate {
+                disparity,
+                threshold: 3.0,
+            });
+            stereo_matches(
+                &features(&[40.0]),
+                &features(right_us),
+                [&left, &right],
+                60.0,
+                gate.as_ref(),
+                &config,
+            )
         };
         // Two equal candidates: the ratio cannot choose, the gate can.
         let (none, _) = run(&[34.0, 20.0], None);

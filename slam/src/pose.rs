@@ -33,7 +33,13 @@ impl Observation {
     /// disparity is known. `None` when the point is behind the camera.
     pub(crate) fn residual(&self, rig: &RectifiedRig, p_cam: &Point3<f64>) -> Option<Vector3<f64>> {
         let seen = rig.project(p_cam)?;
-        Some(Vector3::new(self.u - seen.u, self.v - seen.v, self.d.map_or(0.0, |d| d - seen.d)) / self.sigma)
+        Some(
+            Vector3::new(
+                self.u - seen.u,
+                self.v - seen.v,
+                self.d.map_or(0.0, |d| d - seen.d),
+            ) / self.sigma,
+        )
     }
 
     /// Whether a squared residual is that of a true match.
@@ -55,7 +61,9 @@ impl Observation {
 pub fn reprojection_jacobian(rig: &RectifiedRig, p_cam: &Point3<f64>) -> Matrix3x6<f64> {
     let mut motion = Matrix3x6::zeros();
     motion.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-    motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-se3::skew(&p_cam.coords));
+    motion
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&-se3::skew(&p_cam.coords));
     rig.projection_jacobian(p_cam) * motion
 }
 
@@ -79,7 +87,11 @@ impl PoseEstimate {
 /// Minimises the Huber loss of the stereo reprojection errors over the six parameters of the pose,
 /// by Levenberg-Marquardt, in four rounds; each round leaves out what the last one contradicts.
 #[allow(non_snake_case)]
-pub fn optimise_pose(rig: &RectifiedRig, observations: &[Observation], T_guess: &Se3) -> PoseEstimate {
+pub fn optimise_pose(
+    rig: &RectifiedRig,
+    observations: &[Observation],
+    T_guess: &Se3,
+) -> PoseEstimate {
     let mut T_cam_world = *T_guess;
     let mut inliers = vec![true; observations.len()];
     for round in 0..4 {
@@ -94,14 +106,34 @@ pub fn optimise_pose(rig: &RectifiedRig, observations: &[Observation], T_guess: 
             break;
         }
     }
-    PoseEstimate { T_cam_world, inliers }
+    PoseEstimate {
+        T_cam_world,
+        inliers,
+    }
 }
 
 #[allow(non_snake_case)]
-fn levenberg_marquardt(rig: &RectifiedRig, observations: &[Observation], used: &[bool], T_start: Se3, huber: f64) -> Se3 {
-    let active = || observations.iter().zip(used).filter(|(_, used)| **used).map(|(o, _)| o);
+fn levenberg_marquardt(
+    rig: &RectifiedRig,
+    observations: &[Observation],
+    used: &[bool],
+    T_start: Se3,
+    huber: f64,
+) -> Se3 {
+    let active = || {
+        observations
+            .iter()
+            .zip(used)
+            .filter(|(_, used)| **used)
+            .map(|(o, _)| o)
+    };
     let cost = |T: &Se3| -> f64 {
-        active().map(|o| o.residual(rig, &(T * o.point)).map_or(1e3, |r| huber_cost(r.norm_squared(), huber))).sum()
+        active()
+            .map(|o| {
+                o.residual(rig, &(T * o.point))
+                    .map_or(1e3, |r| huber_cost(r.norm_squared(), huber))
+            })
+            .sum()
     };
     let mut T_cam_world = T_start;
     let mut current = cost(&T_cam_world);
@@ -111,7 +143,9 @@ fn levenberg_marquardt(rig: &RectifiedRig, observations: &[Observation], used: &
         let mut gradient = Vector6::zeros();
         for o in active() {
             let p_cam = T_cam_world * o.point;
-            let Some(residual) = o.residual(rig, &p_cam) else { continue };
+            let Some(residual) = o.residual(rig, &p_cam) else {
+                continue;
+            };
             let full = reprojection_jacobian(rig, &p_cam) / o.sigma;
             let mut jacobian = full;
             if o.d.is_none() {
@@ -121,8 +155,11 @@ fn levenberg_marquardt(rig: &RectifiedRig, observations: &[Observation], used: &
             hessian += jacobian.transpose() * jacobian * weight;
             gradient += jacobian.transpose() * residual * weight;
         }
-        let damped = hessian + Matrix6::from_diagonal(&(hessian.diagonal() * lambda).add_scalar(1e-9));
-        let Some(step) = damped.cholesky().map(|c| c.solve(&gradient)) else { break };
+        let damped =
+            hessian + Matrix6::from_diagonal(&(hessian.diagonal() * lambda).add_scalar(1e-9));
+        let Some(step) = damped.cholesky().map(|c| c.solve(&gradient)) else {
+            break;
+        };
         let candidate = se3::exp(&step) * T_cam_world;
         let next = cost(&candidate);
         if next < current {
@@ -139,21 +176,38 @@ fn levenberg_marquardt(rig: &RectifiedRig, observations: &[Observation], used: &
 }
 
 pub(crate) fn huber_cost(squared: f64, huber: f64) -> f64 {
-    if squared <= huber * huber { squared } else { 2.0 * huber * squared.sqrt() - huber * huber }
+    if squared <= huber * huber {
+        squared
+    } else {
+        2.0 * huber * squared.sqrt() - huber * huber
+    }
 }
 
 pub(crate) fn huber_weight(squared: f64, huber: f64) -> f64 {
-    if squared <= huber * huber { 1.0 } else { huber / squared.sqrt() }
+    if squared <= huber * huber {
+        1.0
+    } else {
+        huber / squared.sqrt()
+    }
 }
 
 /// The pose that most observations agree with, from samples of three whose positions in the camera
 /// are known by their disparity. `None` when no sample finds `enough`.
 #[allow(non_snake_case)]
-pub(crate) fn sample_pose(rig: &RectifiedRig, observations: &[Observation], enough: usize, rng: &mut ChaCha8Rng) -> Option<Se3> {
+pub(crate) fn sample_pose(
+    rig: &RectifiedRig,
+    observations: &[Observation],
+    enough: usize,
+    rng: &mut ChaCha8Rng,
+) -> Option<Se3> {
     let seen: Vec<(Point3<f64>, Point3<f64>)> = observations
         .iter()
         .filter_map(|o| {
-            let p_cam = rig.back_project(StereoPoint { u: o.u, v: o.v, d: o.d? })?;
+            let p_cam = rig.back_project(StereoPoint {
+                u: o.u,
+                v: o.v,
+                d: o.d?,
+            })?;
             Some((o.point, p_cam))
         })
         .collect();
@@ -163,11 +217,16 @@ pub(crate) fn sample_pose(rig: &RectifiedRig, observations: &[Observation], enou
     let mut best: Option<(usize, Se3)> = None;
     for _ in 0..300 {
         let sample: Vec<_> = seen.sample(rng, 3).copied().collect();
-        let Some(T_cam_world) = align(&sample) else { continue };
+        let Some(T_cam_world) = align(&sample) else {
+            continue;
+        };
         let agree = observations
             .iter()
             // Three-point poses are rough: four standard deviations.
-            .filter(|o| o.residual(rig, &(T_cam_world * o.point)).is_some_and(|r| r.norm_squared() < 16.0))
+            .filter(|o| {
+                o.residual(rig, &(T_cam_world * o.point))
+                    .is_some_and(|r| r.norm_squared() < 16.0)
+            })
             .count();
         if agree >= enough && best.is_none_or(|(most, _)| agree > most) {
             best = Some((agree, T_cam_world));
@@ -180,7 +239,9 @@ pub(crate) fn sample_pose(rig: &RectifiedRig, observations: &[Observation], enou
 /// (Umeyama 1991, without scale). `None` for points on a line.
 fn align(pairs: &[(Point3<f64>, Point3<f64>)]) -> Option<Se3> {
     let n = pairs.len() as f64;
-    let centre = |f: fn(&(Point3<f64>, Point3<f64>)) -> Vector3<f64>| pairs.iter().map(f).sum::<Vector3<f64>>() / n;
+    let centre = |f: fn(&(Point3<f64>, Point3<f64>)) -> Vector3<f64>| {
+        pairs.iter().map(f).sum::<Vector3<f64>>() / n
+    };
     let (from, to) = (centre(|p| p.0.coords), centre(|p| p.1.coords));
     let mut covariance = Matrix3::zeros();
     for (a, b) in pairs {
@@ -193,7 +254,8 @@ fn align(pairs: &[(Point3<f64>, Point3<f64>)]) -> Option<Se3> {
     let (u, v_t) = (svd.u?, svd.v_t?);
     let sign = (u * v_t).determinant().signum();
     let rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign)) * v_t;
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    let rotation =
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     Some(Se3::from_parts((to - rotation * from).into(), rotation))
 }
 
@@ -203,7 +265,16 @@ pub(crate) mod tests {
     use rand::{RngExt, SeedableRng};
 
     pub(crate) fn rig() -> RectifiedRig {
-        RectifiedRig { width: 512, height: 288, fx: 220.0, fy: 230.0, cx: 250.0, cy: 140.0, doffs: 1.5, baseline: 0.09 }
+        RectifiedRig {
+            width: 512,
+            height: 288,
+            fx: 220.0,
+            fy: 230.0,
+            cx: 250.0,
+            cy: 140.0,
+            doffs: 1.5,
+            baseline: 0.09,
+        }
     }
 
     /// Points in view of a pose, and where it sees them.
@@ -217,7 +288,13 @@ pub(crate) mod tests {
                     d: rng.random_range(4.0..40.0),
                 };
                 let point = pose.inverse() * rig().back_project(at).unwrap();
-                Observation { point, u: at.u, v: at.v, d: Some(at.d), sigma: 1.0 }
+                Observation {
+                    point,
+                    u: at.u,
+                    v: at.v,
+                    d: Some(at.d),
+                    sigma: 1.0,
+                }
             })
             .collect()
     }
@@ -243,7 +320,10 @@ pub(crate) mod tests {
             let mut step = Vector6::zeros();
             step[k] = 1e-6;
             let numeric = (project(step) - project(-step)) / 2e-6;
-            assert!((numeric - analytic.column(k)).norm() < 1e-5 * (1.0 + numeric.norm()), "column {k}");
+            assert!(
+                (numeric - analytic.column(k)).norm() < 1e-5 * (1.0 + numeric.norm()),
+                "column {k}"
+            );
         }
     }
 
@@ -274,7 +354,14 @@ pub(crate) mod tests {
 
     #[test]
     fn points_on_a_line_fix_no_pose() {
-        let line: Vec<_> = (0..3).map(|i| (Point3::new(i as f64, 0.0, 0.0), Point3::new(0.0, i as f64, 1.0))).collect();
+        let line: Vec<_> = (0..3)
+            .map(|i| {
+                (
+                    Point3::new(i as f64, 0.0, 0.0),
+                    Point3::new(0.0, i as f64, 1.0),
+                )
+            })
+            .collect();
         assert!(align(&line).is_none());
     }
 }

@@ -13,7 +13,9 @@ use serde::Serialize;
 use crate::bundle_adjustment::BundleAdjustment;
 use crate::features::{Features, Orb};
 use crate::map::{Keyframe, Map, PointId};
-use crate::matching::{DisparityGate, Grid, MatchCounts, match_all, match_projections, stereo_matches};
+use crate::matching::{
+    DisparityGate, Grid, MatchCounts, match_all, match_projections, stereo_matches,
+};
 use crate::pose::{Observation, PoseEstimate, optimise_pose, sample_pose};
 use crate::{Keypoint, SlamConfig, SlamError};
 
@@ -92,7 +94,11 @@ pub struct Slam {
 
 impl Slam {
     /// SLAM for a rig. Without an engine there is no dense disparity and no gate.
-    pub fn new(rig: RectifiedRig, config: SlamConfig, engine: Option<Box<dyn DisparityEngine>>) -> Self {
+    pub fn new(
+        rig: RectifiedRig,
+        config: SlamConfig,
+        engine: Option<Box<dyn DisparityEngine>>,
+    ) -> Self {
         let orb = Orb::new(config.features, config.corner_threshold);
         Self {
             rig,
@@ -146,7 +152,9 @@ impl Slam {
         }
 
         let T_predicted = self.predict(frame.time);
-        let local = self.map.points_since(self.map.keyframes.len().saturating_sub(self.config.window));
+        let local = self
+            .map
+            .points_since(self.map.keyframes.len().saturating_sub(self.config.window));
         let found = self
             .track_by_projection(&seen, &local, &T_predicted)
             .or_else(|| self.track_by_looks(&seen, &local, frame.index));
@@ -154,8 +162,12 @@ impl Slam {
         match found {
             Some((pose, matches)) => {
                 let T_cam_world = pose.T_cam_world;
-                let inliers: Vec<(PointId, usize)> =
-                    matches.iter().zip(&pose.inliers).filter(|(_, i)| **i).map(|(m, _)| *m).collect();
+                let inliers: Vec<(PointId, usize)> = matches
+                    .iter()
+                    .zip(&pose.inliers)
+                    .filter(|(_, i)| **i)
+                    .map(|(m, _)| *m)
+                    .collect();
                 (report.tracked, report.inliers) = (true, inliers.len());
                 self.learn_velocity(frame.time, &T_cam_world);
                 self.most_inliers = self.most_inliers.max(inliers.len());
@@ -182,15 +194,33 @@ impl Slam {
             .placed
             .iter()
             .map(|p| {
-                let T_keyframe_world = self.map.keyframes.get(p.keyframe).map_or_else(Se3::identity, |k| k.T_cam_world);
-                StampedPose { time: p.time, T_world_cam: (p.T_cam_keyframe * T_keyframe_world).inverse() }
+                let T_keyframe_world = self
+                    .map
+                    .keyframes
+                    .get(p.keyframe)
+                    .map_or_else(Se3::identity, |k| k.T_cam_world);
+                StampedPose {
+                    time: p.time,
+                    T_world_cam: (p.T_cam_keyframe * T_keyframe_world).inverse(),
+                }
             })
             .collect();
         let keyframe = |k: &Keyframe| {
-            (k.frame, k.name.clone(), StampedPose { time: k.time, T_world_cam: k.T_cam_world.inverse() })
+            (
+                k.frame,
+                k.name.clone(),
+                StampedPose {
+                    time: k.time,
+                    T_world_cam: k.T_cam_world.inverse(),
+                },
+            )
         };
         let keyframes = self.map.keyframes.iter().map(keyframe).collect();
-        SlamResult { trajectory: Trajectory { poses }, keyframes, map: self.map }
+        SlamResult {
+            trajectory: Trajectory { poses },
+            keyframes,
+            map: self.map,
+        }
     }
 
     fn check_size(&self, frame: &StereoFrame) -> Result<(), SlamError> {
@@ -198,7 +228,13 @@ impl Slam {
             let (width, height) = image.dimensions();
             if (width as usize, height as usize) != (self.rig.width, self.rig.height) {
                 let (rig_width, rig_height) = (self.rig.width, self.rig.height);
-                return Err(SlamError::Size { frame: frame.name.clone(), width, height, rig_width, rig_height });
+                return Err(SlamError::Size {
+                    frame: frame.name.clone(),
+                    width,
+                    height,
+                    rig_width,
+                    rig_height,
+                });
             }
         }
         Ok(())
@@ -208,12 +244,27 @@ impl Slam {
         let grey = [luma(&frame.left), luma(&frame.right)];
         let orb = &self.orb;
         let (left, right) = rayon::join(|| orb.extract(&grey[0]), || orb.extract(&grey[1]));
-        let failed = |message| SlamError::Features { frame: frame.name.clone(), message };
+        let failed = |message| SlamError::Features {
+            frame: frame.name.clone(),
+            message,
+        };
         let features = [left.map_err(failed)?, right.map_err(failed)?];
-        let (disparities, matches) =
-            stereo_matches(&features[0], &features[1], [&grey[0], &grey[1]], self.max_disparity(), None, &self.config);
+        let (disparities, matches) = stereo_matches(
+            &features[0],
+            &features[1],
+            [&grey[0], &grey[1]],
+            self.max_disparity(),
+            None,
+            &self.config,
+        );
         let grid = Grid::new(&features[0].keypoints, self.rig.width, self.rig.height);
-        Ok(Seen { grey, features, disparities, matches, grid })
+        Ok(Seen {
+            grey,
+            features,
+            disparities,
+            matches,
+            grid,
+        })
     }
 
     /// A quarter of the width is nearer than any rig of use is focused.
@@ -246,7 +297,12 @@ impl Slam {
     /// Matches local points where the predicted pose puts them, in windows that widen until enough
     /// agree, then once more, narrowly, from the pose that came out.
     #[allow(non_snake_case)]
-    fn track_by_projection(&self, seen: &Seen, local: &[PointId], T_predicted: &Se3) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
+    fn track_by_projection(
+        &self,
+        seen: &Seen,
+        local: &[PointId],
+        T_predicted: &Se3,
+    ) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
         for radius in [12.0, 24.0, 48.0] {
             let matches = self.project_and_match(seen, local, T_predicted, radius);
             if matches.len() < self.config.min_inliers {
@@ -262,45 +318,93 @@ impl Slam {
 
     /// Matches by descriptor alone and samples a pose: for jumps that no prediction covers.
     #[allow(non_snake_case)]
-    fn track_by_looks(&self, seen: &Seen, local: &[PointId], frame: usize) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
-        let descriptors: Vec<_> = local.iter().map(|id| self.map.points[id].descriptor).collect();
+    fn track_by_looks(
+        &self,
+        seen: &Seen,
+        local: &[PointId],
+        frame: usize,
+    ) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
+        let descriptors: Vec<_> = local
+            .iter()
+            .map(|id| self.map.points[id].descriptor)
+            .collect();
         let matches: Vec<(PointId, usize)> =
-            match_all(&descriptors, &seen.features[0], &self.config).into_iter().map(|(i, f)| (local[i], f)).collect();
+            match_all(&descriptors, &seen.features[0], &self.config)
+                .into_iter()
+                .map(|(i, f)| (local[i], f))
+                .collect();
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
         rng.set_stream(frame as u64);
-        let T_sampled = sample_pose(&self.rig, &self.observations(seen, &matches), self.config.min_inliers, &mut rng)?;
+        let T_sampled = sample_pose(
+            &self.rig,
+            &self.observations(seen, &matches),
+            self.config.min_inliers,
+            &mut rng,
+        )?;
         self.refine(seen, local, T_sampled)
     }
 
     #[allow(non_snake_case)]
-    fn refine(&self, seen: &Seen, local: &[PointId], T_rough: Se3) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
+    fn refine(
+        &self,
+        seen: &Seen,
+        local: &[PointId],
+        T_rough: Se3,
+    ) -> Option<(PoseEstimate, Vec<(PointId, usize)>)> {
         let matches = self.project_and_match(seen, local, &T_rough, 6.0);
         let pose = optimise_pose(&self.rig, &self.observations(seen, &matches), &T_rough);
         (pose.count() >= self.config.min_inliers).then_some((pose, matches))
     }
 
     #[allow(non_snake_case)]
-    fn project_and_match(&self, seen: &Seen, local: &[PointId], T_cam_world: &Se3, radius: f64) -> Vec<(PointId, usize)> {
+    fn project_and_match(
+        &self,
+        seen: &Seen,
+        local: &[PointId],
+        T_cam_world: &Se3,
+        radius: f64,
+    ) -> Vec<(PointId, usize)> {
         let (mut ids, mut expected) = (Vec::new(), Vec::new());
         for id in local {
             let point = &self.map.points[id];
-            let Some(at) = self.rig.project(&(T_cam_world * point.position)) else { continue };
-            if (0.0..self.rig.width as f64).contains(&at.u) && (0.0..self.rig.height as f64).contains(&at.v) {
+            let Some(at) = self.rig.project(&(T_cam_world * point.position)) else {
+                continue;
+            };
+            if (0.0..self.rig.width as f64).contains(&at.u)
+                && (0.0..self.rig.height as f64).contains(&at.v)
+            {
                 ids.push(*id);
-                expected.push((point.descriptor, Keypoint { u: at.u, v: at.v, octave: point.octave }));
+                expected.push((
+                    point.descriptor,
+                    Keypoint {
+                        u: at.u,
+                        v: at.v,
+                        octave: point.octave,
+                    },
+                ));
             }
         }
-        match_projections(&expected, &seen.features[0], &seen.grid, radius, &self.config)
-            .into_iter()
-            .map(|(i, feature)| (ids[i], feature))
-            .collect()
+        match_projections(
+            &expected,
+            &seen.features[0],
+            &seen.grid,
+            radius,
+            &self.config,
+        )
+        .into_iter()
+        .map(|(i, feature)| (ids[i], feature))
+        .collect()
     }
 
     fn observations(&self, seen: &Seen, matches: &[(PointId, usize)]) -> Vec<Observation> {
         matches
             .iter()
             .map(|(id, feature)| {
-                observation(self.map.points[id].position, &seen.features[0].keypoints[*feature], seen.disparities[*feature])
+                observation(
+                    self.map.points[id].position,
+                    &seen.features[0].keypoints[*feature],
+                    seen.disparities[*feature],
+                )
             })
             .collect()
     }
@@ -309,8 +413,16 @@ impl Slam {
     #[allow(non_snake_case)]
     fn place(&mut self, time: f64, T_cam_world: Se3) {
         let keyframe = self.map.keyframes.len().saturating_sub(1);
-        let T_keyframe_world = self.map.keyframes.last().map_or_else(Se3::identity, |k| k.T_cam_world);
-        self.placed.push(Placed { time, keyframe, T_cam_keyframe: T_cam_world * T_keyframe_world.inverse() });
+        let T_keyframe_world = self
+            .map
+            .keyframes
+            .last()
+            .map_or_else(Se3::identity, |k| k.T_cam_world);
+        self.placed.push(Placed {
+            time,
+            keyframe,
+            T_cam_keyframe: T_cam_world * T_keyframe_world.inverse(),
+        });
         self.last = Some((T_cam_world, time));
     }
 
@@ -332,11 +444,20 @@ impl Slam {
             let started = Instant::now();
             let mut dense = engine
                 .disparity(&frame.left, &frame.right)
-                .map_err(|source| SlamError::Disparity { frame: frame.name.clone(), source })?;
-            Rejection { max_dissimilarity: self.config.max_dissimilarity }.apply(&frame.left, &frame.right, &mut dense);
+                .map_err(|source| SlamError::Disparity {
+                    frame: frame.name.clone(),
+                    source,
+                })?;
+            Rejection {
+                max_dissimilarity: self.config.max_dissimilarity,
+            }
+            .apply(&frame.left, &frame.right, &mut dense);
             report.ms_disparity = started.elapsed().as_secs_f64() * 1e3;
             if self.config.gate {
-                let gate = DisparityGate { disparity: &dense.disparity, threshold: self.config.gate_px };
+                let gate = DisparityGate {
+                    disparity: &dense.disparity,
+                    threshold: self.config.gate_px,
+                };
                 (disparities, report.matches) = stereo_matches(
                     &seen.features[0],
                     &seen.features[1],
@@ -389,7 +510,11 @@ impl Slam {
                 }
                 let p_cam = self.rig.back_project(StereoPoint { u: k.u, v: k.v, d })?;
                 let colour = left.get_pixel_checked(k.u.round() as u32, k.v.round() as u32)?;
-                Some((feature, T_world_cam * p_cam, colour.0.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)))
+                Some((
+                    feature,
+                    T_world_cam * p_cam,
+                    colour.0.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8),
+                ))
             })
             .collect();
         for (feature, position, colour) in new {
@@ -401,10 +526,16 @@ impl Slam {
     /// same points hold the window in place; where there are none, its oldest does.
     fn adjust_locally(&mut self) {
         let first = self.map.keyframes.len().saturating_sub(self.config.window);
-        let ids: Vec<PointId> =
-            self.map.points_since(first).into_iter().filter(|id| self.map.points[id].observations.len() > 1).collect();
-        let mut keyframes: Vec<usize> =
-            ids.iter().flat_map(|id| self.map.points[id].observations.iter().map(|(k, _)| *k)).collect();
+        let ids: Vec<PointId> = self
+            .map
+            .points_since(first)
+            .into_iter()
+            .filter(|id| self.map.points[id].observations.len() > 1)
+            .collect();
+        let mut keyframes: Vec<usize> = ids
+            .iter()
+            .flat_map(|id| self.map.points[id].observations.iter().map(|(k, _)| *k))
+            .collect();
         keyframes.sort_unstable();
         keyframes.dedup();
         let Some(oldest) = keyframes.first().copied() else {
@@ -412,18 +543,29 @@ impl Slam {
         };
         let border = oldest < first;
         let mut problem = BundleAdjustment {
-            T_cam_world: keyframes.iter().map(|k| self.map.keyframes[*k].T_cam_world).collect(),
-            fixed: keyframes.iter().map(|k| if border { *k < first } else { *k == oldest }).collect(),
+            T_cam_world: keyframes
+                .iter()
+                .map(|k| self.map.keyframes[*k].T_cam_world)
+                .collect(),
+            fixed: keyframes
+                .iter()
+                .map(|k| if border { *k < first } else { *k == oldest })
+                .collect(),
             points: ids.iter().map(|id| self.map.points[id].position).collect(),
             observations: Vec::new(),
         };
         for (point, id) in ids.iter().enumerate() {
             for (k, feature) in &self.map.points[id].observations {
                 // Every key frame of an observation is in the list it was collected from.
-                let Ok(pose) = keyframes.binary_search(k) else { continue };
+                let Ok(pose) = keyframes.binary_search(k) else {
+                    continue;
+                };
                 let frame = &self.map.keyframes[*k];
-                let sighting =
-                    observation(problem.points[point], &frame.features.keypoints[*feature], frame.disparities[*feature]);
+                let sighting = observation(
+                    problem.points[point],
+                    &frame.features.keypoints[*feature],
+                    frame.disparities[*feature],
+                );
                 problem.observations.push((pose, point, sighting));
             }
         }
@@ -455,7 +597,12 @@ impl Slam {
             .iter()
             .flatten()
             .copied()
-            .filter(|id| self.map.points.get(id).is_some_and(|p| p.observations.len() < 2))
+            .filter(|id| {
+                self.map
+                    .points
+                    .get(id)
+                    .is_some_and(|p| p.observations.len() < 2)
+            })
             .collect();
         for id in noise {
             self.map.remove(id);
@@ -465,7 +612,9 @@ impl Slam {
     /// A sentence for people.
     fn why_lost(&self, seen: &Seen, what: &str) -> String {
         let pixels = seen.grey[0].as_raw();
-        let share = |test: fn(f32) -> bool| 100 * pixels.iter().filter(|v| test(**v)).count() / pixels.len().max(1);
+        let share = |test: fn(f32) -> bool| {
+            100 * pixels.iter().filter(|v| test(**v)).count() / pixels.len().max(1)
+        };
         format!(
             "{} features, {} with a stereo match; {what}; {} % of the image is saturated, {} % black",
             seen.features[0].keypoints.len(),
@@ -478,5 +627,11 @@ impl Slam {
 
 /// A sighting of a point by a feature.
 fn observation(point: Point3<f64>, keypoint: &Keypoint, d: Option<f64>) -> Observation {
-    Observation { point, u: keypoint.u, v: keypoint.v, d, sigma: keypoint.sigma() }
+    Observation {
+        point,
+        u: keypoint.u,
+        v: keypoint.v,
+        d,
+        sigma: keypoint.sigma(),
+    }
 }

@@ -19,7 +19,12 @@ fn track(source: &dyn StereoSource) -> (usize, TrajectoryScore) {
         milliseconds += report.ms_track;
     }
     let result = slam.finish();
-    let score = score(&result.trajectory, source.true_trajectory().unwrap(), DEFAULT_TOLERANCE).unwrap();
+    let score = score(
+        &result.trajectory,
+        source.true_trajectory().unwrap(),
+        DEFAULT_TOLERANCE,
+    )
+    .unwrap();
     println!(
         "{tracked} of {} frames, {} key frames, {} points, {:.1} ms a frame, ATE SE3 {:.4} m, Sim3 {:.4} m, scale {:.4}",
         source.len(),

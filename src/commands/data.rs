@@ -9,7 +9,9 @@ use crate::output::Output;
 
 /// Look at data, or make some
 #[derive(Parser)]
-#[command(after_help = "Example:\n  barchan data synth synth:seed=1,frames=40 --out data     a rendered rover traverse with truth")]
+#[command(
+    after_help = "Example:\n  barchan data synth synth:seed=1,frames=40 --out data     a rendered rover traverse with truth"
+)]
 pub struct Args {
     #[command(subcommand)]
     what: What,
@@ -47,5 +49,11 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         rig.height,
         out.display()
     );
-    output.result(&Summary { frames: source.len(), out }, &text)
+    output.result(
+        &Summary {
+            frames: source.len(),
+            out,
+        },
+        &text,
+    )
 }

@@ -30,13 +30,31 @@ pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let checks = [
         check("processor", Ok(format!("{cores} cores"))),
         check("shipped weights with Burn", try_shipped()),
-        check("train --device flex", Ok(format!("{:?}", DeviceName::Flex.device()))),
-        check("train --device ndarray", Ok(format!("{:?}", DeviceName::Ndarray.device()))),
-        check("ONNX Runtime", Runtime::load(runtime).map(|r| r.path().display().to_string()).map_err(Into::into)),
+        check(
+            "train --device flex",
+            Ok(format!("{:?}", DeviceName::Flex.device())),
+        ),
+        check(
+            "train --device ndarray",
+            Ok(format!("{:?}", DeviceName::Ndarray.device())),
+        ),
+        check(
+            "ONNX Runtime",
+            Runtime::load(runtime)
+                .map(|r| r.path().display().to_string())
+                .map_err(Into::into),
+        ),
     ];
     let text: String = checks
         .iter()
-        .map(|c| format!("{:<26} {:<4} {}\n", c.name, if c.works { "ok" } else { "no" }, c.detail))
+        .map(|c| {
+            format!(
+                "{:<26} {:<4} {}\n",
+                c.name,
+                if c.works { "ok" } else { "no" },
+                c.detail
+            )
+        })
         .collect();
     output.result(&checks, &text)
 }

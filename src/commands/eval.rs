@@ -59,20 +59,33 @@ fn disparity(pred: &Path, gt: &str, output: &Output) -> Result<()> {
             continue;
         };
         let name = source.name(index);
-        let file = ["pfm", "png"].map(|e| pred.join(format!("{name}.{e}"))).into_iter().find(|f| f.is_file());
+        let file = ["pfm", "png"]
+            .map(|e| pred.join(format!("{name}.{e}")))
+            .into_iter()
+            .find(|f| f.is_file());
         let Some(file) = file else {
-            bail!("{}: no prediction {name}.pfm or {name}.png for frame {name} of {gt}", pred.display());
+            bail!(
+                "{}: no prediction {name}.pfm or {name}.png for frame {name} of {gt}",
+                pred.display()
+            );
         };
-        tally.add(&disparity_file::read(&file)?, &truth).with_context(|| file.display().to_string())?;
+        tally
+            .add(&disparity_file::read(&file)?, &truth)
+            .with_context(|| file.display().to_string())?;
     }
-    let score = tally.score().with_context(|| format!("{gt}: no true disparity"))?;
+    let score = tally
+        .score()
+        .with_context(|| format!("{gt}: no true disparity"))?;
     let line = |title: &str, f: &barchan_eval::disparity::DisparityFigures| {
         format!(
             "{title:<10} {:>7.3} {:>7.2} {:>7.2} {:>7.2} {:>7.2} {:>8.1}\n",
             f.epe, f.bad1, f.bad2, f.bad3, f.d1, f.density
         )
     };
-    let mut text = format!("{:<10} {:>7} {:>7} {:>7} {:>7} {:>7} {:>8}\n", "over", "epe px", "bad1 %", "bad2 %", "bad3 %", "d1 %", "density");
+    let mut text = format!(
+        "{:<10} {:>7} {:>7} {:>7} {:>7} {:>7} {:>8}\n",
+        "over", "epe px", "bad1 %", "bad2 %", "bad3 %", "d1 %", "density"
+    );
     text += &line("all", &score.all);
     if let Some(estimated) = &score.estimated {
         text += &line("estimated", estimated);
@@ -82,7 +95,9 @@ fn disparity(pred: &Path, gt: &str, output: &Output) -> Result<()> {
 
 fn trajectory(est: &Path, gt: &Path, tolerance: f64, output: &Output) -> Result<()> {
     let s = score(&read_trajectory(est)?, &read_trajectory(gt)?, tolerance)?;
-    let rotation = s.rpe_rot_deg_per_m.map_or("truth has no rotation".into(), |r| format!("{r:.3} deg/m"));
+    let rotation = s
+        .rpe_rot_deg_per_m
+        .map_or("truth has no rotation".into(), |r| format!("{r:.3} deg/m"));
     let text = format!(
         "frames           {}\nlength           {:.3} m\nATE, SE3         {:.4} m\nATE, Sim3        {:.4} m (scale {:.4})\n\
          RPE translation  {:.3} %\nRPE rotation     {rotation}",
@@ -94,7 +109,11 @@ fn trajectory(est: &Path, gt: &Path, tolerance: f64, output: &Output) -> Result<
 /// By content: comma-separated with a header, twelve numbers a line (KITTI), or eight (TUM).
 fn read_trajectory(path: &Path) -> Result<Trajectory> {
     let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    let first = text.lines().map(str::trim).find(|l| !l.is_empty() && !l.starts_with('#')).unwrap_or_default();
+    let first = text
+        .lines()
+        .map(str::trim)
+        .find(|l| !l.is_empty() && !l.starts_with('#'))
+        .unwrap_or_default();
     if first.contains(',') {
         return read_csv(path, &text);
     }
@@ -107,12 +126,28 @@ fn read_trajectory(path: &Path) -> Result<Trajectory> {
 /// `time,x,y[,...]` with a header: planar positions.
 fn read_csv(path: &Path, text: &str) -> Result<Trajectory> {
     let mut poses = Vec::new();
-    for (i, line) in text.lines().enumerate().skip(1).filter(|(_, l)| !l.trim().is_empty()) {
-        let numbers: Vec<f64> = line.split(',').take(3).map_while(|w| w.trim().parse().ok()).collect();
+    for (i, line) in text
+        .lines()
+        .enumerate()
+        .skip(1)
+        .filter(|(_, l)| !l.trim().is_empty())
+    {
+        let numbers: Vec<f64> = line
+            .split(',')
+            .take(3)
+            .map_while(|w| w.trim().parse().ok())
+            .collect();
         let [time, x, y] = numbers[..] else {
-            bail!("{}:{}: expected time,x,y and found \"{line}\"", path.display(), i + 1);
+            bail!(
+                "{}:{}: expected time,x,y and found \"{line}\"",
+                path.display(),
+                i + 1
+            );
         };
-        poses.push(StampedPose { time, T_world_cam: Se3::translation(x, y, 0.0) });
+        poses.push(StampedPose {
+            time,
+            T_world_cam: Se3::translation(x, y, 0.0),
+        });
     }
     Ok(Trajectory { poses })
 }

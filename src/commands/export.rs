@@ -30,7 +30,10 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     if args.out.extension().is_none_or(|e| e != "onnx") {
-        bail!("{}: the file to write must end in .onnx", args.out.display());
+        bail!(
+            "{}: the file to write must end in .onnx",
+            args.out.display()
+        );
     }
     let net = load_net(&args.model, &Device::flex())?;
     onnx::save(&net, &args.out)?;
@@ -42,5 +45,12 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         bytes / 1000,
         max_disparity
     );
-    output.result(&Summary { onnx: args.out, bytes, max_disparity }, &text)
+    output.result(
+        &Summary {
+            onnx: args.out,
+            bytes,
+            max_disparity,
+        },
+        &text,
+    )
 }

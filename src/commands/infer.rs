@@ -66,14 +66,18 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let (frames, rig) = open_frames(&args, output)?;
     let mut engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
-    let rejection = (!args.no_reject).then_some(Rejection { max_dissimilarity: args.reject });
+    let rejection = (!args.no_reject).then_some(Rejection {
+        max_dissimilarity: args.reject,
+    });
 
     let bar = output.progress("infer", frames.len());
     let (mut milliseconds, mut density, mut colours) = (vec![], 0.0, None);
     for frame in frames {
         let frame = frame?;
         let started = Instant::now();
-        let mut map = engine.disparity(&frame.left, &frame.right).with_context(|| format!("frame {}", frame.name))?;
+        let mut map = engine
+            .disparity(&frame.left, &frame.right)
+            .with_context(|| format!("frame {}", frame.name))?;
         milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
         density += match rejection {
             Some(rejection) => rejection.apply(&frame.left, &frame.right, &mut map),
@@ -82,7 +86,10 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         let name = &frame.name;
         disparity_file::write_png(&out.path(format!("disparity/{name}.png"))?, &map.disparity)?;
         disparity_file::write_pfm(&out.path(format!("disparity/{name}.pfm"))?, &map.disparity)?;
-        write_share(&map.confidence, &out.path(format!("confidence/{name}.png"))?)?;
+        write_share(
+            &map.confidence,
+            &out.path(format!("confidence/{name}.png"))?,
+        )?;
         // Colours of the first frame hold for all, so that frames compare.
         let range = *colours.get_or_insert_with(|| disparity_range(&map.disparity));
         let preview = out.path(format!("preview/{name}.png"))?;
@@ -90,7 +97,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             .save(&preview)
             .with_context(|| preview.display().to_string())?;
         if let Some(rig) = &rig {
-            let cloud = Cloud::from_disparity(rig, &frame.left, &map.disparity, Some(&map.sigma), &DepthLimits::default())?;
+            let cloud = Cloud::from_disparity(
+                rig,
+                &frame.left,
+                &map.disparity,
+                Some(&map.sigma),
+                &DepthLimits::default(),
+            )?;
             cloud.write_ply(&out.path(format!("cloud/{name}.ply"))?)?;
         }
         bar.inc(1);
@@ -99,7 +112,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
 
     let frames = milliseconds.len();
     let (ms_median, ms_p95) = percentiles(milliseconds);
-    let summary = Summary { frames, engine: engine.name(), ms_median, ms_p95, density: density / frames.max(1) as f64 };
+    let summary = Summary {
+        frames,
+        engine: engine.name(),
+        ms_median,
+        ms_p95,
+        density: density / frames.max(1) as f64,
+    };
     out.write_json("summary.json", &summary)?;
     out.finish()?;
     let text = format!(
@@ -127,10 +146,18 @@ fn open_frames(args: &Args, output: &Output) -> Result<(Frames, Option<Rectified
         None => (0..source.len()).collect(),
         Some(list) => select(source.as_ref(), list)?,
     };
-    Ok((Box::new(prefetch(source, order, 4).map(|f| f.map_err(Into::into))), Some(rig)))
+    Ok((
+        Box::new(prefetch(source, order, 4).map(|f| f.map_err(Into::into))),
+        Some(rig),
+    ))
 }
 
-fn single_pair(left: &Path, right: &Path, rig: Option<&Path>, output: &Output) -> Result<(Frames, Option<RectifiedRig>)> {
+fn single_pair(
+    left: &Path,
+    right: &Path,
+    rig: Option<&Path>,
+    output: &Output,
+) -> Result<(Frames, Option<RectifiedRig>)> {
     let rig = match rig {
         Some(path) => Some(Rig::load(path)?.as_rectified().with_context(|| {
             format!("{}: rectified = false\n  cure: put the pair into a folder with this rig, and give --data", path.display())
@@ -140,13 +167,26 @@ fn single_pair(left: &Path, right: &Path, rig: Option<&Path>, output: &Output) -
             None
         }
     };
-    let name = left.file_stem().map_or("pair".into(), |s| s.to_string_lossy().into_owned());
-    let frame = StereoFrame { index: 0, name, time: 0.0, left: read_rgb(left)?, right: read_rgb(right)? };
+    let name = left
+        .file_stem()
+        .map_or("pair".into(), |s| s.to_string_lossy().into_owned());
+    let frame = StereoFrame {
+        index: 0,
+        name,
+        time: 0.0,
+        left: read_rgb(left)?,
+        right: read_rgb(right)?,
+    };
     if let Some(rig) = &rig
         && frame.left.dimensions() != (rig.width as u32, rig.height as u32)
     {
         let (w, h) = frame.left.dimensions();
-        bail!("{}: {w} x {h} pixels, but the rig says {} x {}", left.display(), rig.width, rig.height);
+        bail!(
+            "{}: {w} x {h} pixels, but the rig says {} x {}",
+            left.display(),
+            rig.width,
+            rig.height
+        );
     }
     Ok((Box::new(std::iter::once(Ok(frame))), rig))
 }
@@ -160,10 +200,13 @@ fn select(source: &dyn StereoSource, list: &Path) -> Result<Vec<usize>> {
         .map(|(i, line)| (i, line.trim()))
         .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
         .map(|(i, line)| {
-            names
-                .iter()
-                .position(|n| n == line)
-                .with_context(|| format!("{}:{}: there is no frame named \"{line}\"", list.display(), i + 1))
+            names.iter().position(|n| n == line).with_context(|| {
+                format!(
+                    "{}:{}: there is no frame named \"{line}\"",
+                    list.display(),
+                    i + 1
+                )
+            })
         })
         .collect()
 }

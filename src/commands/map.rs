@@ -48,7 +48,12 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     let (rig, keyframes) = open_run(&args.run)?;
-    let mut config = MapConfig { voxel: args.voxel, cell: args.cell, min_points: args.min_points, ..MapConfig::default() };
+    let mut config = MapConfig {
+        voxel: args.voxel,
+        cell: args.cell,
+        min_points: args.min_points,
+        ..MapConfig::default()
+    };
     config.limits.max_depth = args.max_depth;
     let out = StagedDir::new(&args.out, "summary.json")?;
 
@@ -103,7 +108,12 @@ struct KeyframeFiles {
 
 impl KeyframeFiles {
     fn read(self) -> Result<DenseKeyframe> {
-        let file = |folder: &str| self.run.join("keyframes").join(folder).join(format!("{}.png", self.name));
+        let file = |folder: &str| {
+            self.run
+                .join("keyframes")
+                .join(folder)
+                .join(format!("{}.png", self.name))
+        };
         Ok(DenseKeyframe {
             T_world_cam: self.pose.T_world_cam,
             left: read_rgb(&file("left"))?,
@@ -118,26 +128,44 @@ impl KeyframeFiles {
 fn open_run(run: &Path) -> Result<(barchan_geometry::RectifiedRig, Vec<KeyframeFiles>)> {
     let trajectory = run.join("keyframes.tum");
     if !trajectory.is_file() {
-        bail!("{}: no run of `barchan slam` (there is no keyframes.tum)\n  cure: `barchan slam --data DATA --out {0}` makes one", run.display());
+        bail!(
+            "{}: no run of `barchan slam` (there is no keyframes.tum)\n  cure: `barchan slam --data DATA --out {0}` makes one",
+            run.display()
+        );
     }
     let rig_file = run.join("rig.toml");
-    let rig = Rig::load(&rig_file)?.as_rectified().with_context(|| format!("{}: not rectified", rig_file.display()))?;
+    let rig = Rig::load(&rig_file)?
+        .as_rectified()
+        .with_context(|| format!("{}: not rectified", rig_file.display()))?;
     let poses = Trajectory::read_tum(&trajectory)?.poses;
     let folder = run.join("keyframes/disparity");
     let entries = folder.read_dir().with_context(|| {
-        format!("{}: no disparity in this run\n  cure: run `barchan slam` with --model", folder.display())
+        format!(
+            "{}: no disparity in this run\n  cure: run `barchan slam` with --model",
+            folder.display()
+        )
     })?;
     let mut names: Vec<String> = entries
         .filter_map(|e| Some(e.ok()?.path().file_stem()?.to_str()?.to_owned()))
         .collect();
     names.sort();
     if names.len() != poses.len() {
-        bail!("{}: {} poses, but {} disparity images in {}", trajectory.display(), poses.len(), names.len(), folder.display());
+        bail!(
+            "{}: {} poses, but {} disparity images in {}",
+            trajectory.display(),
+            poses.len(),
+            names.len(),
+            folder.display()
+        );
     }
     let keyframes = names
         .into_iter()
         .zip(poses)
-        .map(|(name, pose)| KeyframeFiles { run: run.to_owned(), name, pose })
+        .map(|(name, pose)| KeyframeFiles {
+            run: run.to_owned(),
+            name,
+            pose,
+        })
         .collect();
     Ok((rig, keyframes))
 }

@@ -9,7 +9,9 @@ use crate::output::Output;
 
 /// Products of any DEM
 #[derive(Parser)]
-#[command(after_help = "Example:\n  barchan raster hillshade dem.tif --out hillshade.tif --azimuth 300 --altitude 30")]
+#[command(
+    after_help = "Example:\n  barchan raster hillshade dem.tif --out hillshade.tif --azimuth 300 --altitude 30"
+)]
 pub struct Args {
     #[command(subcommand)]
     product: Product,
@@ -44,9 +46,22 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let Product::Hillshade { input, out, azimuth, altitude, z } = args.product;
+    let Product::Hillshade {
+        input,
+        out,
+        azimuth,
+        altitude,
+        z,
+    } = args.product;
     let dem = Raster::<f32>::read(&input)?;
-    let shaded = hillshade(&dem, &Light { azimuth, altitude, z });
+    let shaded = hillshade(
+        &dem,
+        &Light {
+            azimuth,
+            altitude,
+            z,
+        },
+    );
     shaded.write(&out)?;
     let (width, height) = (shaded.grid.width, shaded.grid.height);
     let text = format!("{}: {width} x {height}", out.display());

@@ -69,12 +69,15 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     out.write("config.toml", toml::to_string(&config)?)?;
     out.write("rig.toml", Rig::from(*source.rig()).to_toml())?;
     let log = out.path("log.jsonl")?;
-    let mut log = std::io::BufWriter::new(std::fs::File::create(&log).with_context(|| log.display().to_string())?);
+    let mut log = std::io::BufWriter::new(
+        std::fs::File::create(&log).with_context(|| log.display().to_string())?,
+    );
 
     let mut slam = Slam::new(*source.rig(), config, Some(engine));
     let frames = source.len();
     let bar = output.progress("slam", frames);
-    let (mut tracked, mut track_ms, mut disparity_ms, mut matches) = (0, vec![], vec![], MatchCounts::default());
+    let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
+        (0, vec![], vec![], MatchCounts::default());
     let mut total_ms = 0.0;
     for frame in prefetch(source, (0..frames).collect(), 4) {
         let frame = frame?;
@@ -99,7 +102,10 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     drop(log);
     bar.finish_and_clear();
     if tracked == 0 {
-        bail!("{}: no frame could be tracked; the notes above say why", args.data);
+        bail!(
+            "{}: no frame could be tracked; the notes above say why",
+            args.data
+        );
     }
 
     let result = slam.finish();
@@ -155,16 +161,27 @@ fn write_keyframe(out: &StagedDir, frame: usize, left: &Rgb, dense: &DisparityMa
     disparity_file::write_png(&path("disparity")?, &dense.disparity)?;
     disparity_file::write_png(&path("sigma")?, &dense.sigma)?;
     let file = path("left")?;
-    image::DynamicImage::from(left.clone()).to_rgb8().save(&file).with_context(|| file.display().to_string())
+    image::DynamicImage::from(left.clone())
+        .to_rgb8()
+        .save(&file)
+        .with_context(|| file.display().to_string())
 }
 
 fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
     out.write("trajectory.tum", result.trajectory.to_tum())?;
     out.write("trajectory.kitti", result.trajectory.to_kitti())?;
-    let keyframes = Trajectory { poses: result.keyframes.iter().map(|(_, _, pose)| *pose).collect() };
+    let keyframes = Trajectory {
+        poses: result.keyframes.iter().map(|(_, _, pose)| *pose).collect(),
+    };
     out.write("keyframes.tum", keyframes.to_tum())?;
-    let point = |p: &barchan_slam::MapPoint| CloudPoint { position: p.position, colour: p.colour, sigma: f32::NAN };
-    let cloud = Cloud { points: result.map.points.values().map(point).collect() };
+    let point = |p: &barchan_slam::MapPoint| CloudPoint {
+        position: p.position,
+        colour: p.colour,
+        sigma: f32::NAN,
+    };
+    let cloud = Cloud {
+        points: result.map.points.values().map(point).collect(),
+    };
     cloud.write_ply(&out.path("map.ply")?)?;
     Ok(())
 }

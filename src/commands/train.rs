@@ -135,10 +135,19 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     let outcome = trainer.run(|line| {
         seconds += line.seconds;
         steps += 1;
-        bar.set_message(format!("loss {:.4}  {:.2} s/step", line.loss, seconds / steps as f64));
+        bar.set_message(format!(
+            "loss {:.4}  {:.2} s/step",
+            line.loss,
+            seconds / steps as f64
+        ));
         bar.inc(1);
         if bar.is_hidden() && (line.step % 50 == 0 || line.step == total) {
-            output.say(&format!("step {}/{total}  loss {:.4}  {:.2} s/step", line.step, line.loss, seconds / steps as f64));
+            output.say(&format!(
+                "step {}/{total}  loss {:.4}  {:.2} s/step",
+                line.step,
+                line.loss,
+                seconds / steps as f64
+            ));
         }
     });
     bar.finish_and_clear();
@@ -175,7 +184,11 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
 }
 
 fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
-    let data = if args.data.is_empty() { vec!["synth:seed=1,frames=200".to_owned()] } else { args.data.clone() };
+    let data = if args.data.is_empty() {
+        vec!["synth:seed=1,frames=200".to_owned()]
+    } else {
+        args.data.clone()
+    };
     let sources = open_all(&data, output)?;
     let init = match (&args.init, args.finetune) {
         (Some(init), _) => Some(init.clone()),
@@ -187,7 +200,11 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
     let preset = match args.preset {
         PresetArg::Tiny => Preset::Tiny,
     };
-    let schedule = if args.finetune { Schedule::FINETUNE } else { Schedule::PRETRAIN };
+    let schedule = if args.finetune {
+        Schedule::FINETUNE
+    } else {
+        Schedule::PRETRAIN
+    };
     let device = match args.device {
         DeviceArg::Flex => DeviceName::Flex,
         DeviceArg::Ndarray => DeviceName::Ndarray,
@@ -208,7 +225,12 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
             drop_epoch: args.drop_epoch.unwrap_or(schedule.drop_epoch),
             steps: args.steps,
         },
-        loss: Loss { ssim: args.ssim, l1: args.l1, smooth: args.smooth, magnitude: args.magnitude },
+        loss: Loss {
+            ssim: args.ssim,
+            l1: args.l1,
+            smooth: args.smooth,
+            magnitude: args.magnitude,
+        },
         augmentation: Augmentation {
             noise: args.noise,
             brightness: args.brightness,
@@ -229,7 +251,10 @@ fn resume(root: &Path, output: &Output) -> Result<Trainer> {
 }
 
 /// The network started from, if not a random one; the configuration takes its shape.
-fn initial_net(config: &mut TrainConfig, max_disparity: Option<usize>) -> Result<Option<StereoNet>> {
+fn initial_net(
+    config: &mut TrainConfig,
+    max_disparity: Option<usize>,
+) -> Result<Option<StereoNet>> {
     let net = match &config.init {
         Some(init) => Some(load_net(init, &config.device.device().autodiff())?),
         None => None,
@@ -238,13 +263,21 @@ fn initial_net(config: &mut TrainConfig, max_disparity: Option<usize>) -> Result
         config.net = net.config().clone();
     }
     if let Some(max_disparity) = max_disparity {
-        config.net = NetConfig { max_disparity, ..config.net.clone() };
+        config.net = NetConfig {
+            max_disparity,
+            ..config.net.clone()
+        };
     }
-    Ok(net.map(|net| net.with_max_disparity(config.net.max_disparity)).transpose()?)
+    Ok(net
+        .map(|net| net.with_max_disparity(config.net.max_disparity))
+        .transpose()?)
 }
 
 fn open_all(data: &[String], output: &Output) -> Result<Vec<Box<dyn StereoSource>>> {
-    let sources: Vec<_> = data.iter().map(|spec| open_checked(spec, output)).collect::<Result<_>>()?;
+    let sources: Vec<_> = data
+        .iter()
+        .map(|spec| open_checked(spec, output))
+        .collect::<Result<_>>()?;
     if sources.iter().all(|s| s.is_empty()) {
         bail!("{}: no frames", data.join(", "));
     }

@@ -12,7 +12,11 @@ pub fn barchan() -> Command {
 /// Runs it, demands success, and reads its JSON.
 pub fn json(args: &[&str]) -> serde_json::Value {
     let output = barchan().args(args).arg("--json").output().unwrap();
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{args:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
@@ -21,7 +25,10 @@ pub fn refused(args: &[&str]) -> String {
     let output = barchan().args(args).output().unwrap();
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{args:?}: {message}");
-    assert!(message.starts_with("error: ") || message.contains("\nerror: "), "{args:?}: {message}");
+    assert!(
+        message.starts_with("error: ") || message.contains("\nerror: "),
+        "{args:?}: {message}"
+    );
     assert!(!message.contains("panicked"), "{args:?}: {message}");
     message
 }
@@ -30,7 +37,10 @@ pub fn refused(args: &[&str]) -> String {
 pub fn rendered(dir: &Path, frames: usize) -> PathBuf {
     let data = dir.join("data");
     let spec = format!("synth:seed=3,frames={frames},width=192,height=128");
-    barchan().args(["data", "synth", &spec, "--out", text(&data)]).assert().success();
+    barchan()
+        .args(["data", "synth", &spec, "--out", text(&data)])
+        .assert()
+        .success();
     data
 }
 

@@ -18,7 +18,12 @@ pub struct Augmentation {
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Self { noise: 0.01, brightness: 0.1, contrast: 0.2, channel: 0.05 }
+        Self {
+            noise: 0.01,
+            brightness: 0.1,
+            contrast: 0.2,
+            channel: 0.05,
+        }
     }
 }
 
@@ -26,17 +31,28 @@ impl Augmentation {
     /// Changes planar images (red, green, blue) of a pair in place. The change is the same for both
     /// but for the noise, as both cameras look at one scene.
     pub fn apply(&self, pair: [&mut [f32]; 2], rng: &mut impl Rng) {
-        let mut within = |limit: f32| if limit > 0.0 { rng.random_range(-limit..=limit) } else { 0.0 };
+        let mut within = |limit: f32| {
+            if limit > 0.0 {
+                rng.random_range(-limit..=limit)
+            } else {
+                0.0
+            }
+        };
         let contrast = 1.0 + within(self.contrast);
         let brightness = within(self.brightness);
-        let shifts = [within(self.channel), within(self.channel), within(self.channel)];
+        let shifts = [
+            within(self.channel),
+            within(self.channel),
+            within(self.channel),
+        ];
         for image in pair {
             let plane = (image.len() / 3).max(1);
             for (channel, shift) in image.chunks_mut(plane).zip(shifts) {
                 for value in channel {
                     // The sum of three uniforms is normal enough for noise.
                     let unit: f32 = (0..3).map(|_| rng.random_range(-1.0f32..=1.0)).sum();
-                    *value = (*value - 0.5) * contrast + 0.5 + brightness + shift + self.noise * unit;
+                    *value =
+                        (*value - 0.5) * contrast + 0.5 + brightness + shift + self.noise * unit;
                 }
             }
         }

@@ -34,11 +34,15 @@ impl Batch {
         device: &Device,
     ) -> Self {
         let fit = |limit: usize, size: fn(&Rgb) -> u32| {
-            samples.iter().map(|(f, _)| size(&f.left) as usize).fold(limit, usize::min)
+            samples
+                .iter()
+                .map(|(f, _)| size(&f.left) as usize)
+                .fold(limit, usize::min)
         };
         let (height, width) = (fit(height, Rgb::height), fit(width, Rgb::width));
         let shape = [samples.len(), 3, height, width];
-        let mut images: [Vec<f32>; 4] = std::array::from_fn(|_| Vec::with_capacity(shape.iter().product()));
+        let mut images: [Vec<f32>; 4] =
+            std::array::from_fn(|_| Vec::with_capacity(shape.iter().product()));
         let (mut truth, mut known) = (vec![], vec![]);
         for (frame, disparity) in samples {
             let (w, h) = frame.left.dimensions();
@@ -65,17 +69,29 @@ impl Batch {
             images.map(|data| Tensor::from_data(TensorData::new(data, shape), device));
         let one = [samples.len(), 1, height, width];
         let truth = (truth.len() == one.iter().product::<usize>()).then(|| {
-            [truth, known].map(|data| Tensor::from_data(TensorData::new(data, one), device)).into()
+            [truth, known]
+                .map(|data| Tensor::from_data(TensorData::new(data, one), device))
+                .into()
         });
         let names: Vec<&str> = samples.iter().map(|(f, _)| f.name.as_str()).collect();
-        Self { left, right, seen_left, seen_right, truth, names: names.join(", ") }
+        Self {
+            left,
+            right,
+            seen_left,
+            seen_right,
+            truth,
+            names: names.join(", "),
+        }
     }
 
     /// A whole frame, untouched.
     pub(crate) fn whole(frame: &StereoFrame, device: &Device) -> [Tensor<4>; 2] {
         [&frame.left, &frame.right].map(|image| {
             let (w, h) = (image.width() as usize, image.height() as usize);
-            Tensor::from_data(TensorData::new(planar(image, [0, 0], [w, h]), [1, 3, h, w]), device)
+            Tensor::from_data(
+                TensorData::new(planar(image, [0, 0], [w, h]), [1, 3, h, w]),
+                device,
+            )
         })
     }
 }

@@ -24,7 +24,9 @@ pub enum TrainError {
     #[error("{0}")]
     Config(String),
     /// The loss is no longer a number.
-    #[error("step {step}: the loss is {loss} on {frames}\n  cure: resume from the last checkpoint with a lower --lr, and look at these frames")]
+    #[error(
+        "step {step}: the loss is {loss} on {frames}\n  cure: resume from the last checkpoint with a lower --lr, and look at these frames"
+    )]
     NotFinite {
         /// The step, from 1.
         step: usize,

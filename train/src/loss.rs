@@ -22,7 +22,12 @@ pub struct Loss {
 
 impl Default for Loss {
     fn default() -> Self {
-        Self { ssim: 0.8, l1: 0.2, smooth: 0.1, magnitude: 0.1 }
+        Self {
+            ssim: 0.8,
+            l1: 0.2,
+            smooth: 0.1,
+            magnitude: 0.1,
+        }
     }
 }
 
@@ -82,7 +87,13 @@ impl Loss {
             + l1.clone() * self.l1
             + smooth.clone() * self.smooth
             + magnitude.clone() * self.magnitude;
-        LossTerms { total, ssim, l1, smooth, magnitude }
+        LossTerms {
+            total,
+            ssim,
+            l1,
+            smooth,
+            magnitude,
+        }
     }
 }
 
@@ -100,10 +111,13 @@ pub fn supervised(disparity: &Tensor<4>, truth: &Tensor<4>, known: &Tensor<4>) -
 pub fn warp_right_to_left(right: &Tensor<4>, disparity: &Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let [_, channels, _, width] = right.dims();
     let device = disparity.device();
-    let columns = Tensor::<1, Int>::arange(0..width as i64, &device).float().reshape([1, 1, 1, width]);
+    let columns = Tensor::<1, Int>::arange(0..width as i64, &device)
+        .float()
+        .reshape([1, 1, 1, width]);
     let at = columns - disparity.clone();
     let last = (width - 1) as f32;
-    let inside = at.clone().detach().greater_equal_scalar(0.0).float() * at.clone().detach().lower_equal_scalar(last).float();
+    let inside = at.clone().detach().greater_equal_scalar(0.0).float()
+        * at.clone().detach().lower_equal_scalar(last).float();
     let at = at.clamp(0.0, last);
     let before = at.clone().detach().floor().clamp_max(last - 1.0);
     let a = at - before.clone();
@@ -184,7 +198,12 @@ mod tests {
         let total = |d: &Tensor<4>| Loss::default().self_supervised(&left, &right, d, 16).total;
         let d = disparity.clone().require_grad();
         let gradients = total(&d).backward();
-        let gradient: Vec<f32> = d.grad(&gradients).unwrap().into_data().iter::<f32>().collect();
+        let gradient: Vec<f32> = d
+            .grad(&gradients)
+            .unwrap()
+            .into_data()
+            .iter::<f32>()
+            .collect();
         let base: Vec<f32> = disparity.to_data().iter::<f32>().collect();
         let step = 0.02;
         let (mut worst, mut largest) = (0.0f32, 0.0f32);
@@ -192,7 +211,8 @@ mod tests {
             let at = |offset: f32| {
                 let mut moved = base.clone();
                 moved[i] += offset;
-                let moved = Tensor::<1>::from_floats(moved.as_slice(), &device()).reshape([1, 1, 8, 12]);
+                let moved =
+                    Tensor::<1>::from_floats(moved.as_slice(), &device()).reshape([1, 1, 8, 12]);
                 total(&moved).into_scalar::<f32>()
             };
             let numeric = (at(step) - at(-step)) / (2.0 * step);
@@ -200,7 +220,10 @@ mod tests {
             largest = largest.max(gradient[i].abs());
         }
         assert!(largest > 1e-4, "the gradient vanishes: {largest}");
-        assert!(worst < 0.05 * largest, "worst {worst}, largest gradient {largest}");
+        assert!(
+            worst < 0.05 * largest,
+            "worst {worst}, largest gradient {largest}"
+        );
     }
 
     #[test]
@@ -209,18 +232,28 @@ mod tests {
         let d = Tensor::<4>::full([1, 1, 8, 12], 3.0, &device());
         let (warped, inside) = warp_right_to_left(&right, &d);
         let shifted = right.clone().narrow(3, 0, 9);
-        let difference = (warped.narrow(3, 3, 9) - shifted).abs().max().into_scalar::<f32>();
+        let difference = (warped.narrow(3, 3, 9) - shifted)
+            .abs()
+            .max()
+            .into_scalar::<f32>();
         assert!(difference < 1e-6, "{difference}");
-        assert_eq!(inside.clone().narrow(3, 0, 3).sum().into_scalar::<f32>(), 0.0);
+        assert_eq!(
+            inside.clone().narrow(3, 0, 3).sum().into_scalar::<f32>(),
+            0.0
+        );
         assert_eq!(inside.narrow(3, 3, 9).mean().into_scalar::<f32>(), 1.0);
     }
 
     #[test]
     fn equal_images_have_no_dissimilarity_and_opposite_ones_have_much() {
         let (left, _, _) = scene();
-        let same = structural_dissimilarity(&left, &left).max().into_scalar::<f32>();
+        let same = structural_dissimilarity(&left, &left)
+            .max()
+            .into_scalar::<f32>();
         assert!(same < 1e-5, "{same}");
-        let opposite = structural_dissimilarity(&left, &(-left.clone() + 1.0)).mean().into_scalar::<f32>();
+        let opposite = structural_dissimilarity(&left, &(-left.clone() + 1.0))
+            .mean()
+            .into_scalar::<f32>();
         assert!(opposite > 0.5, "{opposite}");
     }
 
@@ -229,21 +262,32 @@ mod tests {
         let device = device();
         let step = |height: f32| {
             let row: Vec<f32> = (0..12).map(|x| if x < 6 { 0.0 } else { height }).collect();
-            Tensor::<1>::from_floats(row.as_slice(), &device).reshape([1, 1, 1, 12]).repeat_dim(2, 8)
+            Tensor::<1>::from_floats(row.as_slice(), &device)
+                .reshape([1, 1, 1, 12])
+                .repeat_dim(2, 8)
         };
         let disparity = step(0.5);
-        let flat = edge_aware_smoothness(&step(0.0).repeat_dim(1, 3), &disparity).into_scalar::<f32>();
-        let edge = edge_aware_smoothness(&step(0.3).repeat_dim(1, 3), &disparity).into_scalar::<f32>();
+        let flat =
+            edge_aware_smoothness(&step(0.0).repeat_dim(1, 3), &disparity).into_scalar::<f32>();
+        let edge =
+            edge_aware_smoothness(&step(0.3).repeat_dim(1, 3), &disparity).into_scalar::<f32>();
         // One of eleven differences is 0.5; the image step of 0.3 forgives it by exp(-3).
         assert!((flat - 0.5 / 11.0).abs() < 1e-6, "{flat}");
-        assert!((edge / flat - (-3.0f32).exp()).abs() < 1e-4, "{edge} {flat}");
+        assert!(
+            (edge / flat - (-3.0f32).exp()).abs() < 1e-4,
+            "{edge} {flat}"
+        );
     }
 
     #[test]
     fn supervised_loss_is_smooth_l1_over_known_pixels() {
         let device = device();
         let row = |v: [f32; 4]| Tensor::<1>::from_floats(v, &device).reshape([1, 1, 1, 4]);
-        let loss = supervised(&row([1.5, 5.0, 9.0, 2.0]), &row([1.0, 2.0, 0.0, 2.0]), &row([1.0, 1.0, 0.0, 1.0]));
+        let loss = supervised(
+            &row([1.5, 5.0, 9.0, 2.0]),
+            &row([1.0, 2.0, 0.0, 2.0]),
+            &row([1.0, 1.0, 0.0, 1.0]),
+        );
         // (0.5 * 0.25 + 2.5 + 0) / 3
         assert!((loss.into_scalar::<f32>() - 2.625 / 3.0).abs() < 1e-5);
     }

@@ -23,7 +23,10 @@ impl Pool {
             }
             index -= source.len();
         }
-        Err(DataError::Layout { spec: "training data".into(), message: "no frame of that number".into() })
+        Err(DataError::Layout {
+            spec: "training data".into(),
+            message: "no frame of that number".into(),
+        })
     }
 }
 
@@ -40,7 +43,10 @@ impl StereoSource for Pool {
     fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
         let (source, local) = self.find(index)?;
         // The caller asks by the pool's index and finds the frame again by it.
-        Ok(StereoFrame { index, ..source.frame(local)? })
+        Ok(StereoFrame {
+            index,
+            ..source.frame(local)?
+        })
     }
 
     fn true_disparity(&self, index: usize) -> Result<Option<Plane>, DataError> {

@@ -44,7 +44,9 @@ impl RunDir {
     /// # Errors
     /// When there is a run already, or the directory cannot be written.
     pub fn create(root: &Path, config: &TrainConfig) -> Result<Self, TrainError> {
-        let run = Self { root: root.to_owned() };
+        let run = Self {
+            root: root.to_owned(),
+        };
         if run.path("config.toml").exists() {
             return Err(run.error(
                 "config.toml",
@@ -62,7 +64,9 @@ impl RunDir {
     /// # Errors
     /// When there is none, or its configuration does not parse.
     pub fn open(root: &Path) -> Result<(Self, TrainConfig), TrainError> {
-        let run = Self { root: root.to_owned() };
+        let run = Self {
+            root: root.to_owned(),
+        };
         let text = std::fs::read_to_string(run.path("config.toml"))
             .map_err(|e| run.error("config.toml", format!("no run to go on with ({e})")))?;
         let config = toml::from_str(&text).map_err(|e| run.error("config.toml", e))?;
@@ -71,12 +75,20 @@ impl RunDir {
 
     /// The weights of a run directory, or the file itself when `path` is one.
     pub fn weights_of(path: &Path) -> PathBuf {
-        if path.is_dir() { path.join("weights.safetensors") } else { path.to_owned() }
+        if path.is_dir() {
+            path.join("weights.safetensors")
+        } else {
+            path.to_owned()
+        }
     }
 
     /// Whether a run stopped before its first checkpoint, so that there is nothing to go on from.
     pub fn is_without_checkpoint(root: &Path) -> bool {
-        Self { root: root.to_owned() }.checkpoints().is_ok_and(|steps| steps.is_empty())
+        Self {
+            root: root.to_owned(),
+        }
+        .checkpoints()
+        .is_ok_and(|steps| steps.is_empty())
     }
 
     /// Where it is.
@@ -124,8 +136,13 @@ impl RunDir {
             std::fs::remove_dir_all(&part).map_err(|e| failed(e.to_string()))?;
         }
         std::fs::create_dir_all(&part).map_err(|e| failed(e.to_string()))?;
-        net.clone().into_record().save(part.join("net.bpk")).map_err(|e| failed(e.to_string()))?;
-        optimizer.save(part.join("optimizer.bpk")).map_err(|e| failed(e.to_string()))?;
+        net.clone()
+            .into_record()
+            .save(part.join("net.bpk"))
+            .map_err(|e| failed(e.to_string()))?;
+        optimizer
+            .save(part.join("optimizer.bpk"))
+            .map_err(|e| failed(e.to_string()))?;
         let state = serde_json::to_vec(state).map_err(|e| failed(e.to_string()))?;
         std::fs::write(part.join("state.json"), state).map_err(|e| failed(e.to_string()))?;
         if done.exists() {
@@ -134,7 +151,8 @@ impl RunDir {
         std::fs::rename(&part, &done).map_err(|e| failed(e.to_string()))?;
         weights::save(net, &self.path("weights.safetensors"))?;
         for old in self.checkpoints()?.into_iter().filter(|s| *s < step) {
-            std::fs::remove_dir_all(self.path(&format!("checkpoints/{old:08}"))).map_err(|e| failed(e.to_string()))?;
+            std::fs::remove_dir_all(self.path(&format!("checkpoints/{old:08}")))
+                .map_err(|e| failed(e.to_string()))?;
         }
         Ok(())
     }
@@ -151,19 +169,30 @@ impl RunDir {
             return Ok((net, optimizer, None));
         };
         let name = format!("checkpoints/{step:08}");
-        let failed = |e: String| self.error(&name, format!("{e}\n  cure: delete this checkpoint and resume again"));
+        let failed = |e: String| {
+            self.error(
+                &name,
+                format!("{e}\n  cure: delete this checkpoint and resume again"),
+            )
+        };
         let folder = self.path(&name);
-        let record = ModuleRecord::load(folder.join("net.bpk")).map_err(|e| failed(e.to_string()))?;
+        let record =
+            ModuleRecord::load(folder.join("net.bpk")).map_err(|e| failed(e.to_string()))?;
         let net = net.load_record(record);
-        let optimizer = optimizer.load(folder.join("optimizer.bpk")).map_err(|e| failed(e.to_string()))?;
+        let optimizer = optimizer
+            .load(folder.join("optimizer.bpk"))
+            .map_err(|e| failed(e.to_string()))?;
         let state = std::fs::read(folder.join("state.json")).map_err(|e| failed(e.to_string()))?;
         let state = serde_json::from_slice(&state).map_err(|e| failed(e.to_string()))?;
         Ok((net, optimizer, Some((step, state))))
     }
 
     fn checkpoints(&self) -> Result<Vec<usize>, TrainError> {
-        let entries = std::fs::read_dir(self.path("checkpoints")).map_err(|e| self.error("checkpoints", e))?;
-        Ok(entries.filter_map(|e| e.ok()?.file_name().to_str()?.parse().ok()).collect())
+        let entries = std::fs::read_dir(self.path("checkpoints"))
+            .map_err(|e| self.error("checkpoints", e))?;
+        Ok(entries
+            .filter_map(|e| e.ok()?.file_name().to_str()?.parse().ok())
+            .collect())
     }
 
     fn cut_log(&self, step: usize) -> Result<(), TrainError> {
@@ -187,6 +216,9 @@ impl RunDir {
     }
 
     fn error(&self, name: &str, message: impl ToString) -> TrainError {
-        TrainError::Run { path: self.path(name), message: message.to_string() }
+        TrainError::Run {
+            path: self.path(name),
+            message: message.to_string(),
+        }
     }
 }

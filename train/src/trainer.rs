@@ -4,8 +4,8 @@ use std::time::Instant;
 use barchan_datasets::{StereoSource, prefetch};
 use barchan_model::{Device, NetConfig, StereoNet};
 use burn::module::Module;
-use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::optim::grad_clipping::GradientClippingConfig;
+use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::Tensor;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -55,9 +55,19 @@ pub struct Schedule {
 
 impl Schedule {
     /// From nothing: 10 epochs at 1e-3, the last three at 1e-4 (Hong 2021, 4.2.1).
-    pub const PRETRAIN: Self = Self { epochs: 10, lr: 1e-3, drop_epoch: 7, steps: None };
+    pub const PRETRAIN: Self = Self {
+        epochs: 10,
+        lr: 1e-3,
+        drop_epoch: 7,
+        steps: None,
+    };
     /// From weights: one epoch at 1e-4 (Hong 2021, 4.2.1).
-    pub const FINETUNE: Self = Self { epochs: 1, lr: 1e-4, drop_epoch: usize::MAX >> 1, steps: None };
+    pub const FINETUNE: Self = Self {
+        epochs: 1,
+        lr: 1e-4,
+        drop_epoch: usize::MAX >> 1,
+        steps: None,
+    };
 }
 
 /// Everything that decides a run; written to `config.toml`.
@@ -179,7 +189,9 @@ impl Trainer {
         if let Some(init) = init {
             trainer.net = init.to_device(&trainer.device);
         }
-        let (net, optimizer, state) = trainer.run.restore::<State>(trainer.net, trainer.optimizer)?;
+        let (net, optimizer, state) = trainer
+            .run
+            .restore::<State>(trainer.net, trainer.optimizer)?;
         (trainer.net, trainer.optimizer) = (net, optimizer);
         if let Some((step, state)) = state {
             (trainer.step, trainer.before) = (step, state.before);
@@ -187,7 +199,11 @@ impl Trainer {
         Ok(trainer)
     }
 
-    fn prepare(run: RunDir, config: TrainConfig, sources: Vec<Box<dyn StereoSource>>) -> Result<Self, TrainError> {
+    fn prepare(
+        run: RunDir,
+        config: TrainConfig,
+        sources: Vec<Box<dyn StereoSource>>,
+    ) -> Result<Self, TrainError> {
         let pool = Arc::new(Pool::new(sources)?);
         let (training, held_out) = split(pool.len());
         let device = config.device.device().autodiff();
@@ -196,7 +212,18 @@ impl Trainer {
             .with_epsilon(1e-8)
             .with_grad_clipping(Some(GradientClippingConfig::Norm(1.0)))
             .init();
-        Ok(Self { config, run, device, pool, net, optimizer, training, held_out, step: 0, before: None })
+        Ok(Self {
+            config,
+            run,
+            device,
+            pool,
+            net,
+            optimizer,
+            training,
+            held_out,
+            step: 0,
+            before: None,
+        })
     }
 
     /// The network as it stands.
@@ -212,7 +239,10 @@ impl Trainer {
     /// How many steps are done, and how many there are.
     pub fn progress(&self) -> (usize, usize) {
         let all = self.steps_per_epoch() * self.config.schedule.epochs;
-        (self.step, all.min(self.config.schedule.steps.unwrap_or(usize::MAX)))
+        (
+            self.step,
+            all.min(self.config.schedule.steps.unwrap_or(usize::MAX)),
+        )
     }
 
     /// Held-out pairs before the first step and after the last. Trains in between, telling
@@ -220,7 +250,10 @@ impl Trainer {
     ///
     /// # Errors
     /// When data cannot be read, the run directory not written, or the loss is no number.
-    pub fn run(&mut self, mut on_step: impl FnMut(&LogLine)) -> Result<(Validation, Validation), TrainError> {
+    pub fn run(
+        &mut self,
+        mut on_step: impl FnMut(&LogLine),
+    ) -> Result<(Validation, Validation), TrainError> {
         let before = match self.before {
             Some(before) => before,
             None => self.validate()?,
@@ -259,25 +292,45 @@ impl Trainer {
     fn step(&mut self, samples: &[Sample], epoch: usize) -> Result<LogLine, TrainError> {
         let started = Instant::now();
         let mut rng = self.rng(2 * self.step as u64 + 1);
-        let batch = Batch::crop(samples, self.config.crop, Some(&self.config.augmentation), &mut rng, &self.device);
+        let batch = Batch::crop(
+            samples,
+            self.config.crop,
+            Some(&self.config.augmentation),
+            &mut rng,
+            &self.device,
+        );
 
         let prediction = self.net.forward(batch.seen_left, batch.seen_right);
-        let terms =
-            self.config.loss.self_supervised(&batch.left, &batch.right, &prediction.disparity, self.config.net.max_disparity);
+        let terms = self.config.loss.self_supervised(
+            &batch.left,
+            &batch.right,
+            &prediction.disparity,
+            self.config.net.max_disparity,
+        );
         let total = match (&batch.truth, self.config.supervised) {
             (Some((truth, known)), true) => {
                 // What the network cannot say it is not asked.
-                let reachable = truth.clone().lower_equal_scalar((self.config.net.max_disparity - 2) as f32).float();
+                let reachable = truth
+                    .clone()
+                    .lower_equal_scalar((self.config.net.max_disparity - 2) as f32)
+                    .float();
                 loss::supervised(&prediction.disparity, truth, &(known.clone() * reachable))
             }
             (None, true) => {
-                return Err(TrainError::Config(format!("--supervised: {} has no true disparity", batch.names)));
+                return Err(TrainError::Config(format!(
+                    "--supervised: {} has no true disparity",
+                    batch.names
+                )));
             }
             (_, false) => terms.total.clone(),
         };
         let value = total.clone().into_scalar::<f32>();
         if !value.is_finite() {
-            return Err(TrainError::NotFinite { step: self.step + 1, loss: value, frames: batch.names });
+            return Err(TrainError::NotFinite {
+                step: self.step + 1,
+                loss: value,
+                frames: batch.names,
+            });
         }
         let gradients = GradientsParams::from_grads(total.backward(), &self.net);
         let lr = self.lr(epoch);
@@ -309,18 +362,34 @@ impl Trainer {
         for frame in prefetch(self.pool.clone(), self.held_out.clone(), 2) {
             let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame?, &device);
             let disparity = net.forward(left.clone(), right.clone()).disparity;
-            let terms = self.config.loss.self_supervised(&left, &right, &disparity, self.config.net.max_disparity).values();
+            let terms = self
+                .config
+                .loss
+                .self_supervised(&left, &right, &disparity, self.config.net.max_disparity)
+                .values();
             ssim += terms.ssim;
             l1 += terms.l1;
         }
         let n = self.held_out.len() as f32;
         let (ssim, l1) = (ssim / n, l1 / n);
         let photometric = self.config.loss.ssim * ssim + self.config.loss.l1 * l1;
-        Ok(Validation { frames: self.held_out.len(), photometric, ssim, l1 })
+        Ok(Validation {
+            frames: self.held_out.len(),
+            photometric,
+            ssim,
+            l1,
+        })
     }
 
     fn checkpoint(&self) -> Result<(), TrainError> {
-        self.run.checkpoint(self.step, &self.net, &self.optimizer, &State { before: self.before })
+        self.run.checkpoint(
+            self.step,
+            &self.net,
+            &self.optimizer,
+            &State {
+                before: self.before,
+            },
+        )
     }
 
     /// The run directory.
@@ -329,7 +398,11 @@ impl Trainer {
     }
 
     fn truth_of(&self, index: usize) -> Result<Option<barchan_datasets::Plane>, TrainError> {
-        Ok(if self.config.supervised { self.pool.true_disparity(index)? } else { None })
+        Ok(if self.config.supervised {
+            self.pool.true_disparity(index)?
+        } else {
+            None
+        })
     }
 
     fn steps_per_epoch(&self) -> usize {
@@ -363,7 +436,9 @@ fn split(frames: usize) -> (Vec<usize>, Vec<usize>) {
     if frames < 2 {
         return ((0..frames).collect(), (0..frames).collect());
     }
-    let held_out: Vec<usize> = (0..held).map(|k| (2 * k + 1) * frames / (2 * held)).collect();
+    let held_out: Vec<usize> = (0..held)
+        .map(|k| (2 * k + 1) * frames / (2 * held))
+        .collect();
     let training = (0..frames).filter(|i| !held_out.contains(i)).collect();
     (training, held_out)
 }

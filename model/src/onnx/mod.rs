@@ -21,8 +21,11 @@ pub fn to_bytes(net: &StereoNet) -> Vec<u8> {
     let mut graph = writer::GraphWriter::default();
     let (left, right) = ("left".to_owned(), "right".to_owned());
     let prediction = net.run(&mut graph, &left, &right);
-    let outputs =
-        [("disparity", prediction.disparity), ("confidence", prediction.confidence), ("sigma", prediction.sigma)];
+    let outputs = [
+        ("disparity", prediction.disparity),
+        ("confidence", prediction.confidence),
+        ("sigma", prediction.sigma),
+    ];
     for (name, value) in &outputs {
         graph.output(name, value);
     }
@@ -30,8 +33,14 @@ pub fn to_bytes(net: &StereoNet) -> Vec<u8> {
     let map = |name: &str| proto::ValueInfo::float(name, ["batch", "1", "height", "width"]);
     let metadata = [
         ("max_disparity", net.config().max_disparity.to_string()),
-        ("input", "RGB in 0..1, rectified, rows corresponding".to_owned()),
-        ("disparity", "pixels, x_right = x_left - disparity".to_owned()),
+        (
+            "input",
+            "RGB in 0..1, rectified, rows corresponding".to_owned(),
+        ),
+        (
+            "disparity",
+            "pixels, x_right = x_left - disparity".to_owned(),
+        ),
     ];
     let model = proto::Model {
         ir_version: 8,
@@ -45,10 +54,16 @@ pub fn to_bytes(net: &StereoNet) -> Vec<u8> {
             input: vec![image("left"), image("right")],
             output: outputs.iter().map(|(name, _)| map(name)).collect(),
         }),
-        opset_import: vec![proto::OperatorSet { domain: String::new(), version: OPSET }],
+        opset_import: vec![proto::OperatorSet {
+            domain: String::new(),
+            version: OPSET,
+        }],
         metadata_props: metadata
             .into_iter()
-            .map(|(key, value)| proto::StringStringEntry { key: key.into(), value })
+            .map(|(key, value)| proto::StringStringEntry {
+                key: key.into(),
+                value,
+            })
             .collect(),
     };
     model.encode_to_vec()

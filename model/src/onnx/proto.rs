@@ -83,16 +83,36 @@ pub struct Attribute {
 
 impl Attribute {
     pub fn float(name: &str, value: f32) -> Self {
-        Self { name: name.into(), f: Some(value), kind: 1, ..Self::default() }
+        Self {
+            name: name.into(),
+            f: Some(value),
+            kind: 1,
+            ..Self::default()
+        }
     }
     pub fn int(name: &str, value: i64) -> Self {
-        Self { name: name.into(), i: Some(value), kind: 2, ..Self::default() }
+        Self {
+            name: name.into(),
+            i: Some(value),
+            kind: 2,
+            ..Self::default()
+        }
     }
     pub fn string(name: &str, value: &str) -> Self {
-        Self { name: name.into(), s: Some(value.into()), kind: 3, ..Self::default() }
+        Self {
+            name: name.into(),
+            s: Some(value.into()),
+            kind: 3,
+            ..Self::default()
+        }
     }
     pub fn ints(name: &str, values: impl IntoIterator<Item = usize>) -> Self {
-        Self { name: name.into(), ints: values.into_iter().map(|v| v as i64).collect(), kind: 7, ..Self::default() }
+        Self {
+            name: name.into(),
+            ints: values.into_iter().map(|v| v as i64).collect(),
+            kind: 7,
+            ..Self::default()
+        }
     }
 }
 
@@ -172,11 +192,25 @@ impl ValueInfo {
         let dim = dims
             .iter()
             .map(|d| match d.parse() {
-                Ok(value) => Dimension { value: Some(value), param: None },
-                Err(_) => Dimension { value: None, param: Some((*d).into()) },
+                Ok(value) => Dimension {
+                    value: Some(value),
+                    param: None,
+                },
+                Err(_) => Dimension {
+                    value: None,
+                    param: Some((*d).into()),
+                },
             })
             .collect();
-        let tensor = TensorType { elem_type: FLOAT, shape: Some(Shape { dim }) };
-        Self { name: name.into(), kind: Some(Type { tensor: Some(tensor) }) }
+        let tensor = TensorType {
+            elem_type: FLOAT,
+            shape: Some(Shape { dim }),
+        };
+        Self {
+            name: name.into(),
+            kind: Some(Type {
+                tensor: Some(tensor),
+            }),
+        }
     }
 }

@@ -22,10 +22,20 @@ impl GraphWriter {
     fn unique(&mut self, name: &str) -> String {
         let count = self.names.entry(name.to_owned()).or_insert(0);
         *count += 1;
-        if *count == 1 { name.to_owned() } else { format!("{name}.{count}") }
+        if *count == 1 {
+            name.to_owned()
+        } else {
+            format!("{name}.{count}")
+        }
     }
 
-    fn node(&mut self, name: &str, op: &str, inputs: &[&str], attributes: Vec<Attribute>) -> String {
+    fn node(
+        &mut self,
+        name: &str,
+        op: &str,
+        inputs: &[&str],
+        attributes: Vec<Attribute>,
+    ) -> String {
         let name = self.unique(name);
         self.nodes.push(Node {
             input: inputs.iter().map(|i| (*i).to_owned()).collect(),
@@ -50,7 +60,8 @@ impl GraphWriter {
 
     fn scalar(&mut self, value: f32) -> String {
         let name = self.unique("scalar");
-        self.initializers.push(proto::Tensor::floats(&name, &[], [value]));
+        self.initializers
+            .push(proto::Tensor::floats(&name, &[], [value]));
         name
     }
 
@@ -58,7 +69,11 @@ impl GraphWriter {
     fn parameter<const D: usize>(&mut self, name: &str, value: &Tensor<D>) -> String {
         if !self.initializers.iter().any(|t| t.name == name) {
             let data = value.to_data();
-            self.initializers.push(proto::Tensor::floats(name, &value.dims(), data.iter::<f32>()));
+            self.initializers.push(proto::Tensor::floats(
+                name,
+                &value.dims(),
+                data.iter::<f32>(),
+            ));
         }
         name.to_owned()
     }
@@ -72,7 +87,10 @@ impl GraphWriter {
         x: &str,
         attributes: Vec<Attribute>,
     ) -> String {
-        let mut inputs = vec![x.to_owned(), self.parameter(&format!("{name}.weight"), weight)];
+        let mut inputs = vec![
+            x.to_owned(),
+            self.parameter(&format!("{name}.weight"), weight),
+        ];
         if let Some(bias) = bias {
             inputs.push(self.parameter(&format!("{name}.bias"), &bias));
         }
@@ -121,7 +139,14 @@ impl Ops for GraphWriter {
             Attribute::ints("strides", layer.stride),
             Attribute::ints("pads", padding_2d(&layer.padding)),
         ];
-        self.convolution("Conv", name, &layer.weight.val(), layer.bias.as_ref().map(|b| b.val()), x, attributes)
+        self.convolution(
+            "Conv",
+            name,
+            &layer.weight.val(),
+            layer.bias.as_ref().map(|b| b.val()),
+            x,
+            attributes,
+        )
     }
     fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &String) -> String {
         let attributes = vec![
@@ -129,7 +154,14 @@ impl Ops for GraphWriter {
             Attribute::ints("strides", layer.stride),
             Attribute::ints("pads", both_ends(&layer.padding)),
         ];
-        self.convolution("ConvTranspose", name, &layer.weight.val(), layer.bias.as_ref().map(|b| b.val()), x, attributes)
+        self.convolution(
+            "ConvTranspose",
+            name,
+            &layer.weight.val(),
+            layer.bias.as_ref().map(|b| b.val()),
+            x,
+            attributes,
+        )
     }
     fn conv3d(&mut self, name: &str, layer: &Conv3d, x: &String) -> String {
         let attributes = vec![
@@ -137,7 +169,14 @@ impl Ops for GraphWriter {
             Attribute::ints("strides", layer.stride),
             Attribute::ints("pads", both_ends(&padding_3d(&layer.padding))),
         ];
-        self.convolution("Conv", name, &layer.weight.val(), layer.bias.as_ref().map(|b| b.val()), x, attributes)
+        self.convolution(
+            "Conv",
+            name,
+            &layer.weight.val(),
+            layer.bias.as_ref().map(|b| b.val()),
+            x,
+            attributes,
+        )
     }
     fn conv_transpose3d(&mut self, name: &str, layer: &ConvTranspose3d, x: &String) -> String {
         let attributes = vec![
@@ -145,13 +184,26 @@ impl Ops for GraphWriter {
             Attribute::ints("strides", layer.stride),
             Attribute::ints("pads", both_ends(&layer.padding)),
         ];
-        self.convolution("ConvTranspose", name, &layer.weight.val(), layer.bias.as_ref().map(|b| b.val()), x, attributes)
+        self.convolution(
+            "ConvTranspose",
+            name,
+            &layer.weight.val(),
+            layer.bias.as_ref().map(|b| b.val()),
+            x,
+            attributes,
+        )
     }
     fn fixed_conv2d(&mut self, name: &str, kernel: &Kernel, stride: usize, x: &String) -> String {
         let weight = self.unique(&format!("{name}.kernel"));
-        self.initializers.push(proto::Tensor::floats(&weight, &kernel.shape, kernel.data.iter().copied()));
-        let attributes =
-            vec![Attribute::ints("kernel_shape", [kernel.shape[2], kernel.shape[3]]), Attribute::ints("strides", [stride; 2])];
+        self.initializers.push(proto::Tensor::floats(
+            &weight,
+            &kernel.shape,
+            kernel.data.iter().copied(),
+        ));
+        let attributes = vec![
+            Attribute::ints("kernel_shape", [kernel.shape[2], kernel.shape[3]]),
+            Attribute::ints("strides", [stride; 2]),
+        ];
         self.node(name, "Conv", &[x, &weight], attributes)
     }
 
@@ -163,9 +215,22 @@ impl Ops for GraphWriter {
     }
     fn instance_norm(&mut self, channels: usize, epsilon: f64, x: &String) -> String {
         let (one, zero) = (self.unique("normal.scale"), self.unique("normal.bias"));
-        self.initializers.push(proto::Tensor::floats(&one, &[channels], vec![1.0; channels]));
-        self.initializers.push(proto::Tensor::floats(&zero, &[channels], vec![0.0; channels]));
-        self.node("normal", "InstanceNormalization", &[x, &one, &zero], vec![Attribute::float("epsilon", epsilon as f32)])
+        self.initializers.push(proto::Tensor::floats(
+            &one,
+            &[channels],
+            vec![1.0; channels],
+        ));
+        self.initializers.push(proto::Tensor::floats(
+            &zero,
+            &[channels],
+            vec![0.0; channels],
+        ));
+        self.node(
+            "normal",
+            "InstanceNormalization",
+            &[x, &one, &zero],
+            vec![Attribute::float("epsilon", epsilon as f32)],
+        )
     }
     fn add(&mut self, a: &String, b: &String) -> String {
         self.plain("Add", &[a, b], vec![])
@@ -209,7 +274,11 @@ impl Ops for GraphWriter {
     }
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> String {
         let name = self.unique(name);
-        self.initializers.push(proto::Tensor::floats(&name, &[1, values.len(), 1, 1], values.iter().copied()));
+        self.initializers.push(proto::Tensor::floats(
+            &name,
+            &[1, values.len(), 1, 1],
+            values.iter().copied(),
+        ));
         name
     }
     fn add_volume(&mut self, a: &String, b: &String) -> String {
@@ -225,7 +294,10 @@ impl Ops for GraphWriter {
     }
     fn stack(&mut self, maps: &[String]) -> String {
         let axis = self.ints(&[2]);
-        let planes: Vec<String> = maps.iter().map(|m| self.plain("Unsqueeze", &[m, &axis], vec![])).collect();
+        let planes: Vec<String> = maps
+            .iter()
+            .map(|m| self.plain("Unsqueeze", &[m, &axis], vec![]))
+            .collect();
         let inputs: Vec<&str> = planes.iter().map(String::as_str).collect();
         self.plain("Concat", &inputs, vec![Attribute::int("axis", 2)])
     }
@@ -254,7 +326,11 @@ impl Ops for GraphWriter {
         let missing = self.plain("Sub", &[&multiple, &over], vec![]);
         let missing = self.plain("Mod", &[&missing, &multiple], vec![]);
         let before = self.ints(&[0; 6]);
-        let pads = self.plain("Concat", &[&before, &missing], vec![Attribute::int("axis", 0)]);
+        let pads = self.plain(
+            "Concat",
+            &[&before, &missing],
+            vec![Attribute::int("axis", 0)],
+        );
         self.plain("Pad", &[x, &pads], vec![Attribute::string("mode", "edge")])
     }
     fn crop_to(&mut self, like: &String, x: &String) -> String {
@@ -263,7 +339,10 @@ impl Ops for GraphWriter {
         self.plain("Slice", &[x, &from, &size, &axes], vec![])
     }
     fn depth_to_space(&mut self, r: usize, x: &String) -> String {
-        let attributes = vec![Attribute::int("blocksize", r as i64), Attribute::string("mode", "CRD")];
+        let attributes = vec![
+            Attribute::int("blocksize", r as i64),
+            Attribute::string("mode", "CRD"),
+        ];
         self.plain("DepthToSpace", &[x], attributes)
     }
 }
