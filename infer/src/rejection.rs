@@ -30,8 +30,8 @@ impl Rejection {
         let warped = warp_right_to_left(&luma(right), &map.disparity);
         let dissimilarity = structural_dissimilarity(&luma(left), &warped);
         for (d, s) in map.disparity.iter_mut().zip(dissimilarity.iter()) {
-            // NaN, where the warp fell outside, is not below the threshold either.
-            if !(*s <= self.max_dissimilarity) {
+            // NaN is where the warp fell outside.
+            if s.is_nan() || *s > self.max_dissimilarity {
                 *d = f32::NAN;
             }
         }
@@ -115,4 +115,81 @@ pub fn structural_dissimilarity(a: &Plane, b: &Plane) -> Plane {
             }
         });
     Plane::from_raw(width, height, out).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: (u32, u32) = (48, 24);
+
+    fn texture(x: f32, y: f32) -> f32 {
+        0.5 + 0.2 * (0.9 * x + 0.2 * y).sin() + 0.2 * (0.31 * x - 1.1 * y).sin()
+    }
+
+    fn image(shift: f32) -> Rgb {
+        Rgb::from_fn(SIZE.0, SIZE.1, |x, y| {
+            image::Rgb([texture(x as f32 + shift, y as f32); 3])
+        })
+    }
+
+    fn map(disparity: impl Fn(u32, u32) -> f32) -> DisparityMap {
+        let known = Plane::from_pixel(SIZE.0, SIZE.1, image::Luma([1.0]));
+        let disparity = Plane::from_fn(SIZE.0, SIZE.1, |x, y| image::Luma([disparity(x, y)]));
+        DisparityMap {
+            disparity,
+            sigma: known.clone(),
+            confidence: known,
+        }
+    }
+
+    #[test]
+    fn warping_by_the_true_disparity_restores_the_left_image() {
+        let warped = warp_right_to_left(&luma(&image(5.0)), &map(|_, _| 5.0).disparity);
+        for (x, y, value) in warped.enumerate_pixels() {
+            if x < 5 {
+                assert!(value.0[0].is_nan());
+            } else {
+                assert!((value.0[0] - texture(x as f32, y as f32)).abs() < 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn true_pixels_stay_false_ones_and_the_unseen_go() {
+        // The lower half claims a disparity that the texture contradicts.
+        let mut map = map(|_, y| if y < 12 { 5.0 } else { 8.5 });
+        let share = Rejection::default().apply(&image(0.0), &image(5.0), &mut map);
+        let at = |x, y| map.disparity.get_pixel(x, y).0[0];
+        assert!(
+            (5..48).all(|x| (0..9).all(|y| at(x, y) == 5.0)),
+            "a true pixel was rejected"
+        );
+        assert!(
+            (0..5).all(|x| (0..12).all(|y| at(x, y).is_nan())),
+            "an unseen pixel was kept"
+        );
+        let kept = (9..48)
+            .flat_map(|x| (16..24).map(move |y| (x, y)))
+            .filter(|(x, y)| at(*x, *y).is_finite())
+            .count();
+        assert!(
+            kept < 39 * 8 / 4,
+            "{kept} of {} false pixels were kept",
+            39 * 8
+        );
+        assert!((share - map.density()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn dissimilarity_is_symmetric_zero_for_equals_and_within_bounds() {
+        let (a, b) = (luma(&image(0.0)), luma(&image(2.3)));
+        let (ab, ba) = (
+            structural_dissimilarity(&a, &b),
+            structural_dissimilarity(&b, &a),
+        );
+        assert!(ab.iter().zip(ba.iter()).all(|(x, y)| (x - y).abs() < 1e-5));
+        assert!(ab.iter().all(|v| (0.0..=1.0).contains(v)));
+        assert!(structural_dissimilarity(&a, &a).iter().all(|v| *v < 1e-4));
+    }
 }

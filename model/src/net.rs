@@ -62,7 +62,7 @@ impl NetConfig {
     pub fn check(&self) -> Result<(), ModelError> {
         let refuse = |message: &str| Err(ModelError::Config(message.into()));
         if self.max_disparity == 0
-            || self.max_disparity % (4 * SCALE) != 0
+            || !self.max_disparity.is_multiple_of(4 * SCALE)
             || self.max_disparity > 1024
         {
             return refuse("max_disparity must be a multiple of 16, at most 1024");
@@ -76,7 +76,7 @@ impl NetConfig {
         if channels.iter().any(|c| !(1..=1024).contains(c)) {
             return refuse("channels and groups must be 1 to 1024");
         }
-        if self.matching % self.groups != 0 {
+        if !self.matching.is_multiple_of(self.groups) {
             return refuse("matching must be a multiple of groups");
         }
         Ok(())

@@ -21,6 +21,9 @@ pub struct BundleAdjustment {
     pub observations: Vec<(usize, usize, Observation)>,
 }
 
+/// A twist for each free pose and a shift for each point.
+type Steps = (Vec<Vector6<f64>>, Vec<Vector3<f64>>);
+
 /// How a solution went.
 #[derive(Clone, Copy, Debug)]
 pub struct Summary {
@@ -121,7 +124,7 @@ impl BundleAdjustment {
         unknown_poses: usize,
         by_point: &[Vec<usize>],
         lambda: f64,
-    ) -> Option<(Vec<Vector6<f64>>, Vec<Vector3<f64>>)> {
+    ) -> Option<Steps> {
         let n = 6 * unknown_poses;
         let mut reduced = DMatrix::<f64>::zeros(n, n);
         let mut right = DVector::<f64>::zeros(n);

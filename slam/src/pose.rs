@@ -21,6 +21,9 @@ pub struct Observation {
     pub sigma: f64,
 }
 
+/// A point in the world and in the camera frame.
+type PointPair = (Point3<f64>, Point3<f64>);
+
 /// Squared distances in standard deviations that 5 % of true matches exceed: chi-square of two
 /// degrees of freedom, and of three with disparity.
 const CHI2: [f64; 2] = [5.991, 7.815];
@@ -200,7 +203,7 @@ pub(crate) fn sample_pose(
     enough: usize,
     rng: &mut ChaCha8Rng,
 ) -> Option<Se3> {
-    let seen: Vec<(Point3<f64>, Point3<f64>)> = observations
+    let seen: Vec<PointPair> = observations
         .iter()
         .filter_map(|o| {
             let p_cam = rig.back_project(StereoPoint {
@@ -237,11 +240,9 @@ pub(crate) fn sample_pose(
 
 /// The rigid motion that maps the first of each pair to the second, in the least squares sense
 /// (Umeyama 1991, without scale). `None` for points on a line.
-fn align(pairs: &[(Point3<f64>, Point3<f64>)]) -> Option<Se3> {
+fn align(pairs: &[PointPair]) -> Option<Se3> {
     let n = pairs.len() as f64;
-    let centre = |f: fn(&(Point3<f64>, Point3<f64>)) -> Vector3<f64>| {
-        pairs.iter().map(f).sum::<Vector3<f64>>() / n
-    };
+    let centre = |f: fn(&PointPair) -> Vector3<f64>| pairs.iter().map(f).sum::<Vector3<f64>>() / n;
     let (from, to) = (centre(|p| p.0.coords), centre(|p| p.1.coords));
     let mut covariance = Matrix3::zeros();
     for (a, b) in pairs {

@@ -141,7 +141,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
             seconds / steps as f64
         ));
         bar.inc(1);
-        if bar.is_hidden() && (line.step % 50 == 0 || line.step == total) {
+        if bar.is_hidden() && (line.step.is_multiple_of(50) || line.step == total) {
             output.say(&format!(
                 "step {}/{total}  loss {:.4}  {:.2} s/step",
                 line.step,

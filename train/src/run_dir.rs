@@ -15,6 +15,9 @@ pub struct RunDir {
     root: PathBuf,
 }
 
+/// Network, optimiser, and the step and state of the checkpoint they came from.
+pub(crate) type Restored<S> = (StereoNet, ModuleOptimizer, Option<(usize, S)>);
+
 /// One line of `log.jsonl`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct LogLine {
@@ -162,7 +165,7 @@ impl RunDir {
         &self,
         net: StereoNet,
         optimizer: ModuleOptimizer,
-    ) -> Result<(StereoNet, ModuleOptimizer, Option<(usize, S)>), TrainError> {
+    ) -> Result<Restored<S>, TrainError> {
         let step = self.checkpoints()?.into_iter().max();
         self.cut_log(step.unwrap_or(0))?;
         let Some(step) = step else {

@@ -279,7 +279,7 @@ impl Trainer {
                 let line = self.step(&samples, epoch)?;
                 self.run.log(&line)?;
                 on_step(&line);
-                if self.step % self.config.checkpoint_every == 0 || self.step == total {
+                if self.step.is_multiple_of(self.config.checkpoint_every) || self.step == total {
                     self.checkpoint()?;
                 }
             }
