@@ -38,7 +38,7 @@ test: onnxruntime ## every test
 	cargo test $(CARGO_BUILD)
 
 smoke: onnxruntime ## train for a moment on each CPU device, export, ONNX Runtime against Burn
-	cargo test $(CARGO_BUILD) --test smoke -- --nocapture
+	cargo test $(CARGO_BUILD) --test end_to_end smoke -- --nocapture
 
 lint: ## format, clippy and documentation, warnings denied
 	cargo fmt --all --check

@@ -140,7 +140,7 @@ struct State {
     before: Option<Validation>,
 }
 
-/// Runs the schedule. [`Trainer::step`] is figure 4 of the paper.
+/// Runs the schedule. Its private `step` is figure 4 of the paper.
 pub struct Trainer {
     config: TrainConfig,
     run: RunDir,

@@ -1,10 +1,8 @@
 //! Bad input: a plain message that names the file, exit status 2, nothing half-written.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{barchan, refused, rendered, text};
+use crate::program::{barchan, refused, rendered, text};
 
 struct Case {
     dir: tempfile::TempDir,

@@ -1,10 +1,8 @@
 //! Training on the CPU for a few dozen steps, on every CPU device: the loss falls, the network is
 //! exported, and ONNX Runtime agrees with Burn on the trained weights.
 
-mod common;
-
+use crate::program::{barchan, json, rendered, text};
 use barchan_datasets::disparity_file;
-use common::{barchan, json, rendered, text};
 
 fn train_export_and_compare(device: &str, steps: usize) {
     let dir = tempfile::tempdir().unwrap();

@@ -1,10 +1,8 @@
 //! The main job on a rendered sequence with truth: train, export, infer, slam, map, eval.
 
-mod common;
-
 use std::path::Path;
 
-use common::{barchan, json, rendered, text};
+use crate::program::{barchan, json, rendered, text};
 
 fn exists(dir: &Path, files: &[&str]) {
     for file in files {
