@@ -229,14 +229,15 @@ impl Ops for Execute {
         x.clone().squeeze_dim(1)
     }
     fn shift_right(&mut self, by: usize, x: &Tensor<4>) -> Tensor<4> {
-        if by == 0 {
-            return x.clone();
-        }
         let width = x.dims()[3];
-        let by = by.min(width);
-        x.clone()
-            .narrow(3, 0, width - by)
-            .pad((by, 0, 0, 0), PadMode::Constant(0.0))
+        match by {
+            0 => x.clone(),
+            by if by >= width => x.zeros_like(),
+            by => x
+                .clone()
+                .narrow(3, 0, width - by)
+                .pad((by, 0, 0, 0), PadMode::Constant(0.0)),
+        }
     }
     fn pad_edge(&mut self, by: usize, x: &Tensor<4>) -> Tensor<4> {
         x.clone().pad((by, by, by, by), PadMode::Edge)

@@ -156,7 +156,8 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// A new run in `root`, from `init` or from a random network.
+    /// A new run in `root`, from `init` (on the autodiff form of the configured device) or from a
+    /// random network.
     ///
     /// # Errors
     /// When the configuration is refused, or the run directory holds a run already.
@@ -169,7 +170,7 @@ impl Trainer {
         config.check()?;
         let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, sources)?;
         if let Some(init) = init {
-            trainer.net = init.to_device(&trainer.device);
+            trainer.net = init;
         }
         Ok(trainer)
     }
@@ -187,7 +188,7 @@ impl Trainer {
         config.check()?;
         let mut trainer = Self::prepare(run, config, sources)?;
         if let Some(init) = init {
-            trainer.net = init.to_device(&trainer.device);
+            trainer.net = init;
         }
         let (net, optimizer, state) = trainer
             .run

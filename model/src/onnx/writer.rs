@@ -309,10 +309,12 @@ impl Ops for GraphWriter {
         if by == 0 {
             return x.clone();
         }
-        // Negative padding crops: one node shifts.
+        // Pad and cut by the same, so that the width, which the graph does not know, stays.
         let by = by as i64;
-        let pads = self.ints(&[0, 0, 0, by, 0, 0, 0, -by]);
-        self.plain("Pad", &[x, &pads], vec![])
+        let pads = self.ints(&[0, 0, 0, by, 0, 0, 0, 0]);
+        let padded = self.plain("Pad", &[x, &pads], vec![]);
+        let (from, to, axis) = (self.ints(&[0]), self.ints(&[-by]), self.ints(&[3]));
+        self.plain("Slice", &[&padded, &from, &to, &axis], vec![])
     }
     fn pad_edge(&mut self, by: usize, x: &String) -> String {
         let by = by as i64;
