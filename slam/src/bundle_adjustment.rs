@@ -141,7 +141,7 @@ impl BundleAdjustment {
                     continue;
                 };
                 let weight = huber_weight(residual.norm_squared(), HUBER);
-                let projection = o.mask(rig.projection_jacobian(&p_cam)) / o.sigma;
+                let projection = o.whiten(rig.projection_jacobian(&p_cam));
                 let by_position: Matrix3<f64> = projection
                     * self.T_cam_world[*pose]
                         .rotation
@@ -150,10 +150,7 @@ impl BundleAdjustment {
                 h_points += by_position.transpose() * by_position * weight;
                 g_point += by_position.transpose() * residual * weight;
                 if let Some(slot) = free[*pose] {
-                    let mut by_pose: Matrix3x6<f64> = reprojection_jacobian(rig, &p_cam) / o.sigma;
-                    if o.d.is_none() {
-                        by_pose.row_mut(2).fill(0.0);
-                    }
+                    let by_pose: Matrix3x6<f64> = o.whiten(reprojection_jacobian(rig, &p_cam));
                     let h_pose: Matrix6<f64> = by_pose.transpose() * by_pose * weight;
                     let g_pose: Vector6<f64> = by_pose.transpose() * residual * weight;
                     let mut block = reduced.fixed_view_mut::<6, 6>(6 * slot, 6 * slot);
@@ -249,6 +246,7 @@ mod tests {
                             v: s.v,
                             d,
                             sigma: 1.0,
+                            sigma_d: 1.0,
                         },
                     ));
                 }

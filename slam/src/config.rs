@@ -16,6 +16,13 @@ pub struct SlamConfig {
     pub row_tolerance: f64,
     /// Smallest disparity of a point that is mapped, pixels; smaller ones say too little of depth.
     pub min_disparity: f64,
+    /// Standard deviation of a disparity in the optimisations, pixels. A match is better than that;
+    /// but a shift of all disparities, which calibration leaves, is no noise that averages out, and
+    /// motion is better taken from where points go than from how their disparity changes.
+    pub disparity_sigma: f64,
+    /// Standard deviation of a sighting found by alignment with the point's first picture, in pixels
+    /// of its octave.
+    pub alignment_sigma: f64,
     /// Whether dense disparity at key frames accepts and refuses matches (Hong 2021, 3.2.3).
     pub gate: bool,
     /// Largest difference between feature disparity and dense disparity, pixels (Hong 2021, 4.2.2).
@@ -28,8 +35,14 @@ pub struct SlamConfig {
     pub window: usize,
     /// Most iterations of a bundle adjustment.
     pub ba_iterations: usize,
-    /// Fewest inliers of a frame that counts as tracked.
+    /// Fewest map points that must agree with the pose of a frame that counts as tracked.
     pub min_inliers: usize,
+    /// Least share of the matches that must agree with the pose.
+    pub min_match_share: f64,
+    /// Least share of the map points in view that must agree with the pose.
+    pub min_view_share: f64,
+    /// Frames lost in a row after which the map is begun anew at the predicted pose.
+    pub restart_after: usize,
     /// Seeds the sampling of the fall-back.
     pub seed: u64,
 }
@@ -38,11 +51,13 @@ impl Default for SlamConfig {
     fn default() -> Self {
         Self {
             features: 1200,
-            corner_threshold: 8.0,
+            corner_threshold: 5.0,
             nndr: 0.75,
             max_hamming: 64,
             row_tolerance: 1.5,
             min_disparity: 1.5,
+            disparity_sigma: 2.0,
+            alignment_sigma: 0.5,
             gate: true,
             gate_px: 3.0,
             max_dissimilarity: 0.4,
@@ -50,6 +65,9 @@ impl Default for SlamConfig {
             window: 8,
             ba_iterations: 8,
             min_inliers: 15,
+            min_match_share: 0.6,
+            min_view_share: 0.08,
+            restart_after: 5,
             seed: 1,
         }
     }

@@ -14,18 +14,18 @@ pub struct Keypoint {
     pub u: f64,
     /// Row, pixels.
     pub v: f64,
-    /// Level of the image pyramid, 0 the finest; its position is as coarse as the level.
+    /// Level of the image pyramid, 0 the finest.
     pub octave: u8,
+    /// Standard deviation of the position, pixels: a corner is found to a pixel of its level.
+    pub sigma: f64,
 }
 
 /// Scale between two levels of the pyramid.
 pub(crate) const OCTAVE_SCALE: f64 = 1.2;
 
-impl Keypoint {
-    /// Standard deviation of the position, pixels: one pixel of its level.
-    pub fn sigma(&self) -> f64 {
-        OCTAVE_SCALE.powi(i32::from(self.octave))
-    }
+/// Size of a pixel of a pyramid level, in pixels of the image.
+pub(crate) fn octave_scale(octave: u8) -> f64 {
+    OCTAVE_SCALE.powi(i32::from(octave))
 }
 
 /// The features of an image.
@@ -77,15 +77,74 @@ impl Orb {
             .keypoints_xy
             .iter()
             .zip(&found.octaves)
-            .map(|(xy, octave)| Keypoint {
-                u: f64::from(xy[0]),
-                v: f64::from(xy[1]),
-                octave: *octave,
+            .map(|(xy, octave)| {
+                let [u, v] = full_resolution(*xy, *octave, [grey.width(), grey.height()]);
+                Keypoint {
+                    u,
+                    v,
+                    octave: *octave,
+                    sigma: octave_scale(*octave),
+                }
             })
             .collect();
         Ok(Features {
             keypoints,
             descriptors: found.descriptors,
         })
+    }
+}
+
+/// Where a corner of a pyramid level lies in the image. The detector multiplies by the nominal
+/// scale, but levels have whole numbers of pixels and pixel centres are at integers: taken as it
+/// comes, a corner found at two levels would lie more than a pixel apart.
+fn full_resolution(nominal: [f32; 2], octave: u8, size: [u32; 2]) -> [f64; 2] {
+    let scale = octave_scale(octave);
+    std::array::from_fn(|k| {
+        let full = f64::from(size[k]);
+        let level = (full / scale).round_ties_even();
+        let at = (f64::from(nominal[k]) / scale).round();
+        (at + 0.5) * full / level - 0.5
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The corner of a dark square is found at many levels: all must say the same place.
+    #[test]
+    fn levels_of_the_pyramid_agree_on_where_a_corner_is() {
+        let (x, y) = (130, 90);
+        let image = Plane::from_fn(300, 200, |u, v| {
+            image::Luma([if u >= x && v >= y { 0.1 } else { 0.8 }])
+        });
+        let features = Orb::new(300, 20.0).extract(&image).unwrap();
+        let mut levels = std::collections::BTreeSet::new();
+        for k in &features.keypoints {
+            let (du, dv) = (k.u - (f64::from(x) - 0.5), k.v - (f64::from(y) - 0.5));
+            if du.hypot(dv) < 12.0 {
+                assert!(
+                    du.hypot(dv) < 2.0 * k.sigma,
+                    "level {}: {du} {dv}",
+                    k.octave
+                );
+                levels.insert(k.octave);
+            }
+        }
+        assert!(levels.len() >= 5, "{levels:?}");
+    }
+
+    #[test]
+    fn an_image_smaller_than_a_descriptor_has_no_features() {
+        for (width, height) in [(1, 1), (16, 16), (39, 200), (60, 40)] {
+            let image = Plane::from_fn(width, height, |u, v| {
+                image::Luma([((u * v) % 7) as f32 / 7.0])
+            });
+            let found = Orb::new(100, 5.0).extract(&image);
+            assert!(
+                found.is_ok_and(|f| f.keypoints.len() == f.descriptors.len()),
+                "{width} x {height}"
+            );
+        }
     }
 }

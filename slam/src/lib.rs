@@ -13,9 +13,13 @@
 mod bundle_adjustment;
 mod config;
 mod features;
+mod frame;
 mod map;
+mod mapping;
 mod matching;
+mod patch;
 mod pose;
+mod slam;
 mod tracker;
 
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
@@ -23,8 +27,9 @@ pub use config::SlamConfig;
 pub use features::{Descriptor, Features, Keypoint, Orb};
 pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use matching::{DisparityGate, MatchCounts, hamming};
+pub use patch::Patch;
 pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
-pub use tracker::{FrameReport, Slam, SlamResult};
+pub use slam::{FrameReport, Slam, SlamResult};
 
 /// Why SLAM cannot go on.
 #[derive(Debug, thiserror::Error)]

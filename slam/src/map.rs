@@ -6,6 +6,7 @@ use barchan_geometry::Se3;
 use nalgebra::Point3;
 
 use crate::features::{Descriptor, Features};
+use crate::patch::Patch;
 
 /// Names a point of the map for good.
 pub type PointId = usize;
@@ -39,6 +40,8 @@ pub struct MapPoint {
     pub descriptor: Descriptor,
     /// Pyramid level at which it was last seen.
     pub octave: u8,
+    /// Its picture when it was first seen, where it is far enough from the border.
+    pub patch: Option<Patch>,
     /// Its colour, sRGB.
     pub colour: [u8; 3],
     /// Key frame and feature of each sighting.
@@ -63,6 +66,7 @@ impl Map {
         feature: usize,
         position: Point3<f64>,
         colour: [u8; 3],
+        patch: Option<Patch>,
     ) -> PointId {
         let id = self.next;
         self.next += 1;
@@ -73,6 +77,7 @@ impl Map {
             descriptor: frame.features.descriptors[feature],
             octave: frame.features.keypoints[feature].octave,
             colour,
+            patch,
             observations: vec![(keyframe, feature)],
         };
         self.points.insert(id, point);

@@ -1,20 +1,18 @@
 //! Which features are of one thing: left to right along rows, and map to image.
 
 use barchan_datasets::Plane;
+use barchan_geometry::RectifiedRig;
 use serde::{Deserialize, Serialize};
 
-use crate::features::{Descriptor, Features};
+use crate::features::{Descriptor, Features, octave_scale};
 use crate::{Keypoint, SlamConfig};
 
 /// Differing bits of two descriptors.
 pub fn hamming(a: &Descriptor, b: &Descriptor) -> u32 {
-    let words = |d: &Descriptor| -> [u64; 4] {
-        std::array::from_fn(|i| u64::from_le_bytes(std::array::from_fn(|k| d[8 * i + k])))
-    };
-    words(a)
-        .iter()
-        .zip(words(b))
-        .map(|(x, y)| (x ^ y).count_ones())
+    let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
+    a.iter()
+        .zip(b)
+        .map(|(x, y)| (u64::from_ne_bytes(*x) ^ u64::from_ne_bytes(*y)).count_ones())
         .sum()
 }
 
@@ -51,7 +49,8 @@ impl DisparityGate<'_> {
 
 /// Disparity of each left feature, where it has a match in the right image.
 ///
-/// A candidate lies in the same rows, at most an octave away, with a disparity in `0..max`. The
+/// A candidate lies in the same rows, at most an octave away, before the cameras and no nearer than
+/// a disparity of a quarter of the width: no rig of use is focused there. The
 /// nearest neighbour by descriptor is accepted when it is clearly nearer than the second **or** the
 /// gate agrees with it, and refused when the gate contradicts it; the position is then refined by
 /// correlation to a fraction of a pixel.
@@ -59,22 +58,23 @@ pub(crate) fn stereo_matches(
     left: &Features,
     right: &Features,
     images: [&Plane; 2],
-    max_disparity: f64,
+    rig: &RectifiedRig,
     gate: Option<&DisparityGate>,
     config: &SlamConfig,
 ) -> (Vec<Option<f64>>, MatchCounts) {
     let mut counts = MatchCounts::default();
+    let range = -1.0 - rig.doffs..rig.width as f64 / 4.0;
     let rows = by_row(&right.keypoints, images[1].height() as usize);
     let disparities = left
         .keypoints
         .iter()
         .zip(&left.descriptors)
         .map(|(keypoint, descriptor)| {
-            let reach = config.row_tolerance * keypoint.sigma();
+            let reach = config.row_tolerance * octave_scale(keypoint.octave);
             let in_reach = |r: &Keypoint| {
                 (r.v - keypoint.v).abs() <= reach
                     && r.octave.abs_diff(keypoint.octave) <= 1
-                    && (-1.0..max_disparity).contains(&(keypoint.u - r.u))
+                    && range.contains(&(keypoint.u - r.u))
             };
             let from = (keypoint.v - reach).max(0.0) as usize;
             let to = ((keypoint.v + reach) as usize + 1).min(rows.len());
@@ -90,16 +90,18 @@ pub(crate) fn stereo_matches(
             }
             let coarse = keypoint.u - right.keypoints[best].u;
             let by_ratio = f64::from(distance) < config.nndr * f64::from(second);
-            match (by_ratio, gate.and_then(|g| g.agrees(keypoint, coarse))) {
+            let rule = match (by_ratio, gate.and_then(|g| g.agrees(keypoint, coarse))) {
                 (true, Some(false)) => {
                     counts.refused += 1;
                     return None;
                 }
-                (true, _) => counts.ratio += 1,
-                (false, Some(true)) => counts.gate += 1,
+                (true, _) => &mut counts.ratio,
+                (false, Some(true)) => &mut counts.gate,
                 (false, _) => return None,
-            }
-            refine_disparity(images, keypoint, coarse)
+            };
+            let refined = refine_disparity(images, keypoint, coarse)?;
+            *rule += 1;
+            Some(refined)
         })
         .collect();
     (disparities, counts)
@@ -123,11 +125,10 @@ fn two_nearest(
     candidates: impl Iterator<Item = usize>,
     features: &Features,
 ) -> Option<(usize, u32, u32)> {
-    let mut all: Vec<(u32, usize)> = candidates
+    let all: Vec<(u32, usize)> = candidates
         .map(|i| (hamming(descriptor, &features.descriptors[i]), i))
         .collect();
-    all.sort_unstable();
-    let (distance, best) = *all.first()?;
+    let (distance, best) = *all.iter().min()?;
     let at = features.keypoints[best];
     let elsewhere = |i: usize| {
         let k = features.keypoints[i];
@@ -135,8 +136,10 @@ fn two_nearest(
     };
     let second = all
         .iter()
-        .find(|(_, i)| elsewhere(*i))
-        .map_or(256, |(d, _)| *d);
+        .filter(|(_, i)| elsewhere(*i))
+        .map(|(d, _)| *d)
+        .min()
+        .unwrap_or(256);
     Some((best, distance, second))
 }
 
@@ -196,7 +199,7 @@ pub(crate) fn match_projections(
     // For each feature, the best point so far.
     let mut taken: Vec<Option<(u32, usize)>> = vec![None; features.keypoints.len()];
     for (point, (descriptor, at)) in expected.iter().enumerate() {
-        let reach = radius * at.sigma().sqrt();
+        let reach = radius * octave_scale(at.octave).sqrt();
         let near = |i: &usize| {
             let k = features.keypoints[*i];
             (k.u - at.u).abs() <= reach
@@ -328,6 +331,7 @@ mod tests {
                 u: 40.0,
                 v: 20.0,
                 octave: 0,
+                sigma: 1.0,
             };
             let found = refine_disparity([&left, &right], &at, 5.0).unwrap();
             assert!(
@@ -344,12 +348,23 @@ mod tests {
             u,
             v: 20.0,
             octave: 0,
+            sigma: 1.0,
         };
         let features = |us: &[f64]| Features {
             keypoints: us.iter().map(|u| keypoint(*u)).collect(),
             descriptors: vec![[7; 32]; us.len()],
         };
         let config = SlamConfig::default();
+        let rig = RectifiedRig {
+            width: 320,
+            height: 40,
+            fx: 100.0,
+            fy: 100.0,
+            cx: 40.0,
+            cy: 20.0,
+            doffs: 0.0,
+            baseline: 0.1,
+        };
         let dense = |d: f32| Plane::from_pixel(80, 40, image::Luma([d]));
         let run = |right_us: &[f64], gate: Option<f32>| {
             let map = gate.map(dense);
@@ -361,7 +376,7 @@ mod tests {
                 &features(&[40.0]),
                 &features(right_us),
                 [&left, &right],
-                60.0,
+                &rig,
                 gate.as_ref(),
                 &config,
             )

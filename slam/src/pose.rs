@@ -2,9 +2,13 @@
 //! sampling where no guess is near enough.
 
 use barchan_geometry::{RectifiedRig, Se3, StereoPoint, se3};
-use nalgebra::{Matrix3, Matrix3x6, Matrix6, Point3, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{
+    Matrix3, Matrix3x6, Matrix6, Point3, Rotation3, SMatrix, UnitQuaternion, Vector3, Vector6,
+};
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
+
+use crate::Keypoint;
 
 /// A point of the world and where a frame sees it.
 #[derive(Clone, Copy, Debug)]
@@ -17,8 +21,10 @@ pub struct Observation {
     pub v: f64,
     /// Disparity, pixels, where it is known.
     pub d: Option<f64>,
-    /// Standard deviation of the above, pixels.
+    /// Standard deviation of the position, pixels.
     pub sigma: f64,
+    /// Standard deviation of the disparity, pixels.
+    pub sigma_d: f64,
 }
 
 /// A point in the world and in the camera frame.
@@ -32,17 +38,27 @@ const CHI2: [f64; 2] = [5.991, 7.815];
 pub(crate) const HUBER: f64 = 2.0;
 
 impl Observation {
+    /// A point seen by a feature, with a disparity where that is known.
+    pub fn new(point: Point3<f64>, at: &Keypoint, d: Option<f64>, sigma_d: f64) -> Self {
+        Self {
+            point,
+            u: at.u,
+            v: at.v,
+            d,
+            sigma: at.sigma,
+            sigma_d,
+        }
+    }
+
     /// Seen minus projected `(u, v, d)` in standard deviations; the third is zero where no
     /// disparity is known. `None` when the point is behind the camera.
     pub(crate) fn residual(&self, rig: &RectifiedRig, p_cam: &Point3<f64>) -> Option<Vector3<f64>> {
         let seen = rig.project(p_cam)?;
-        Some(
-            Vector3::new(
-                self.u - seen.u,
-                self.v - seen.v,
-                self.d.map_or(0.0, |d| d - seen.d),
-            ) / self.sigma,
-        )
+        Some(Vector3::new(
+            (self.u - seen.u) / self.sigma,
+            (self.v - seen.v) / self.sigma,
+            self.d.map_or(0.0, |d| (d - seen.d) / self.sigma_d),
+        ))
     }
 
     /// Whether a squared residual is that of a true match.
@@ -50,10 +66,18 @@ impl Observation {
         squared <= CHI2[usize::from(self.d.is_some())]
     }
 
-    /// The disparity row of a Jacobian goes where no disparity is known.
-    pub(crate) fn mask(&self, mut jacobian: Matrix3<f64>) -> Matrix3<f64> {
-        if self.d.is_none() {
-            jacobian.row_mut(2).fill(0.0);
+    /// A derivative of `(u, v, d)` in standard deviations; the row of the disparity is zero where
+    /// none is known.
+    pub(crate) fn whiten<const N: usize>(
+        &self,
+        mut jacobian: SMatrix<f64, 3, N>,
+    ) -> SMatrix<f64, 3, N> {
+        let per_d = self.d.map_or(0.0, |_| 1.0 / self.sigma_d);
+        for (row, scale) in [1.0 / self.sigma, 1.0 / self.sigma, per_d]
+            .into_iter()
+            .enumerate()
+        {
+            jacobian.row_mut(row).scale_mut(scale);
         }
         jacobian
     }
@@ -149,11 +173,7 @@ fn levenberg_marquardt(
             let Some(residual) = o.residual(rig, &p_cam) else {
                 continue;
             };
-            let full = reprojection_jacobian(rig, &p_cam) / o.sigma;
-            let mut jacobian = full;
-            if o.d.is_none() {
-                jacobian.row_mut(2).fill(0.0);
-            }
+            let jacobian = o.whiten(reprojection_jacobian(rig, &p_cam));
             let weight = huber_weight(residual.norm_squared(), huber);
             hessian += jacobian.transpose() * jacobian * weight;
             gradient += jacobian.transpose() * residual * weight;
@@ -218,7 +238,7 @@ pub(crate) fn sample_pose(
         return None;
     }
     let mut best: Option<(usize, Se3)> = None;
-    for _ in 0..300 {
+    for _ in 0..1000 {
         let sample: Vec<_> = seen.sample(rng, 3).copied().collect();
         let Some(T_cam_world) = align(&sample) else {
             continue;
@@ -295,6 +315,7 @@ pub(crate) mod tests {
                     v: at.v,
                     d: Some(at.d),
                     sigma: 1.0,
+                    sigma_d: 1.0,
                 }
             })
             .collect()

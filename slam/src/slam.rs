@@ -1,0 +1,280 @@
+//! The whole: frames in, reports and a map out.
+
+use std::time::Instant;
+
+use barchan_datasets::StereoFrame;
+use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
+use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
+use serde::Serialize;
+
+use crate::features::Orb;
+use crate::frame::Seen;
+use crate::map::{Keyframe, Map};
+use crate::mapping::insert_keyframe;
+use crate::matching::{DisparityGate, MatchCounts};
+use crate::tracker::{Placement, Tracker};
+use crate::{SlamConfig, SlamError};
+
+/// What became of one frame.
+#[derive(Clone, Debug, Serialize)]
+pub struct FrameReport {
+    /// Index in the sequence.
+    pub frame: usize,
+    /// Name of the frame.
+    pub name: String,
+    /// Whether its pose is known.
+    pub tracked: bool,
+    /// Map points that agree with the pose.
+    pub inliers: usize,
+    /// Features with a disparity.
+    pub stereo: usize,
+    /// Why it is lost; empty when it is not.
+    pub reason: String,
+    /// Whether it became a key frame.
+    pub keyframe: bool,
+    /// How stereo matches were decided, at key frames.
+    pub matches: MatchCounts,
+    /// Milliseconds from images to pose and map, without dense disparity.
+    pub ms_track: f64,
+    /// Milliseconds of dense disparity; 0 where none was asked for.
+    pub ms_disparity: f64,
+    /// Dense disparity after rejection, at key frames when there is an engine. Not serialised.
+    #[serde(skip)]
+    pub dense: Option<DisparityMap>,
+}
+
+/// What is left when all frames are through.
+#[derive(Clone, Debug)]
+pub struct SlamResult {
+    /// Every frame in order; a lost one has the pose that was predicted for it.
+    pub trajectory: Trajectory,
+    /// Frame index, name and pose of each key frame.
+    pub keyframes: Vec<(usize, String, StampedPose)>,
+    /// Positions in `keyframes` at which the map was begun anew after the camera was lost: how what
+    /// follows lies to what was before is a guess.
+    pub restarts: Vec<usize>,
+    /// The map.
+    pub map: Map,
+}
+
+/// The pose of a frame relative to the key frame it was tracked against, so that it follows when
+/// that one is corrected.
+#[allow(non_snake_case)]
+struct Placed {
+    time: f64,
+    keyframe: usize,
+    T_cam_keyframe: Se3,
+}
+
+/// Tracks a sequence and builds its map.
+pub struct Slam {
+    rig: RectifiedRig,
+    config: SlamConfig,
+    orb: Orb,
+    engine: Option<Box<dyn DisparityEngine>>,
+    tracker: Tracker,
+    map: Map,
+    placed: Vec<Placed>,
+    /// Most inliers of a frame since the last key frame.
+    most_inliers: usize,
+    /// Frames lost in a row.
+    lost: usize,
+    /// See [`SlamResult::restarts`].
+    restarts: Vec<usize>,
+}
+
+impl Slam {
+    /// SLAM for a rig. Without an engine there is no dense disparity and no gate.
+    pub fn new(
+        rig: RectifiedRig,
+        config: SlamConfig,
+        engine: Option<Box<dyn DisparityEngine>>,
+    ) -> Self {
+        Self {
+            orb: Orb::new(config.features, config.corner_threshold),
+            tracker: Tracker::new(rig, config.clone()),
+            rig,
+            config,
+            engine,
+            map: Map::default(),
+            placed: Vec::new(),
+            most_inliers: 0,
+            lost: 0,
+            restarts: Vec::new(),
+        }
+    }
+
+    /// Places one frame against the map, and makes it a key frame when matches run low: under a
+    /// share of the most since the last key frame (Pire 2017). The first frame with enough stereo
+    /// matches is the world; one that comes after many lost ones begins the map anew.
+    ///
+    /// # Errors
+    /// When the frame has not the size of the rig, or a detector or the engine fails. A frame that
+    /// cannot be placed is no error but a report with a reason.
+    #[allow(non_snake_case)]
+    pub fn track(&mut self, frame: &StereoFrame) -> Result<FrameReport, SlamError> {
+        let started = Instant::now();
+        let seen = Seen::new(frame, &self.rig, &self.orb, &self.config)?;
+        let mut report = FrameReport {
+            frame: frame.index,
+            name: frame.name.clone(),
+            tracked: true,
+            inliers: 0,
+            stereo: seen.stereo_count(),
+            reason: String::new(),
+            keyframe: false,
+            matches: seen.matches,
+            ms_track: 0.0,
+            ms_disparity: 0.0,
+            dense: None,
+        };
+        let enough_stereo = report.stereo >= self.config.min_inliers;
+        let T_predicted = self.tracker.predict(frame.time);
+        let guess = Placement {
+            T_cam_world: T_predicted,
+            sightings: Vec::new(),
+        };
+
+        let local = self.local_map();
+        if let Some(placement) = self.tracker.track(&seen, frame.time, &self.map, local) {
+            report.inliers = placement.sightings.len();
+            self.lost = 0;
+            self.most_inliers = self.most_inliers.max(report.inliers);
+            self.tracker.moved_to(placement.T_cam_world, frame.time);
+            let few = self.config.keyframe_ratio * self.most_inliers as f64;
+            if (report.inliers as f64) < few {
+                self.make_keyframe(frame, seen, &placement, &mut report)?;
+            } else {
+                self.place(frame.time, placement.T_cam_world);
+            }
+        } else if self.map.keyframes.is_empty() && enough_stereo {
+            report.inliers = report.stereo;
+            self.tracker.moved_to(T_predicted, frame.time);
+            self.make_keyframe(frame, seen, &guess, &mut report)?;
+        } else {
+            report.tracked = false;
+            report.reason = seen.describe();
+            self.lost += 1;
+            self.tracker.lost_at(T_predicted, frame.time);
+            if self.lost > self.config.restart_after && enough_stereo {
+                report.reason += "; the map begins anew here, at a pose that is a guess";
+                self.lost = 0;
+                self.restarts.push(self.map.keyframes.len());
+                self.make_keyframe(frame, seen, &guess, &mut report)?;
+            } else {
+                self.place(frame.time, T_predicted);
+            }
+        }
+        report.ms_track = started.elapsed().as_secs_f64() * 1e3 - report.ms_disparity;
+        Ok(report)
+    }
+
+    /// Every frame through: poses of all frames, following their corrected key frames.
+    #[allow(non_snake_case)]
+    pub fn finish(self) -> SlamResult {
+        let T_world_cam = |p: &Placed| {
+            let T_keyframe_world = self.map.keyframes.get(p.keyframe).map(|k| k.T_cam_world);
+            (p.T_cam_keyframe * T_keyframe_world.unwrap_or_default()).inverse()
+        };
+        let stamped = |p: &Placed| StampedPose {
+            time: p.time,
+            T_world_cam: T_world_cam(p),
+        };
+        let keyframe = |k: &Keyframe| {
+            let pose = StampedPose {
+                time: k.time,
+                T_world_cam: k.T_cam_world.inverse(),
+            };
+            (k.frame, k.name.clone(), pose)
+        };
+        SlamResult {
+            trajectory: Trajectory {
+                poses: self.placed.iter().map(stamped).collect(),
+            },
+            keyframes: self.map.keyframes.iter().map(keyframe).collect(),
+            restarts: self.restarts,
+            map: self.map,
+        }
+    }
+
+    /// First of the key frames that tracking and adjustment look at: the last few, none from before
+    /// the map was begun anew.
+    fn local_map(&self) -> usize {
+        let last_few = self.map.keyframes.len().saturating_sub(self.config.window);
+        last_few.max(self.restarts.last().copied().unwrap_or(0))
+    }
+
+    /// Dense disparity of the frame, stereo matches gated by it (Hong 2021, 3.2.3), and the frame
+    /// into the map.
+    fn make_keyframe(
+        &mut self,
+        frame: &StereoFrame,
+        mut seen: Seen,
+        placement: &Placement,
+        report: &mut FrameReport,
+    ) -> Result<(), SlamError> {
+        report.keyframe = true;
+        report.dense = self.dense_disparity(frame, report)?;
+        if let Some(dense) = report.dense.as_ref().filter(|_| self.config.gate) {
+            let gate = DisparityGate {
+                disparity: &dense.disparity,
+                threshold: self.config.gate_px,
+            };
+            seen.match_stereo(&self.rig, Some(&gate), &self.config);
+            report.matches = seen.matches;
+        }
+        let keyframe = self.map.keyframes.len();
+        let local = self
+            .local_map()
+            .max((keyframe + 1).saturating_sub(self.config.window));
+        insert_keyframe(
+            &mut self.map,
+            frame,
+            seen,
+            placement,
+            local,
+            &self.rig,
+            &self.config,
+        );
+        self.most_inliers = 0;
+        let settled = self.map.keyframes[keyframe].T_cam_world;
+        self.tracker.corrected_to(settled);
+        self.place(frame.time, settled);
+        Ok(())
+    }
+
+    /// Dense disparity less what the pair itself contradicts; `None` without an engine.
+    fn dense_disparity(
+        &mut self,
+        frame: &StereoFrame,
+        report: &mut FrameReport,
+    ) -> Result<Option<DisparityMap>, SlamError> {
+        let Some(engine) = &mut self.engine else {
+            return Ok(None);
+        };
+        let started = Instant::now();
+        let mut dense = engine
+            .disparity(&frame.left, &frame.right)
+            .map_err(|source| SlamError::Disparity {
+                frame: frame.name.clone(),
+                source,
+            })?;
+        let rejection = Rejection {
+            max_dissimilarity: self.config.max_dissimilarity,
+        };
+        rejection.apply(&frame.left, &frame.right, &mut dense);
+        report.ms_disparity = started.elapsed().as_secs_f64() * 1e3;
+        Ok(Some(dense))
+    }
+
+    /// Notes the pose of a frame relative to the newest key frame.
+    #[allow(non_snake_case)]
+    fn place(&mut self, time: f64, T_cam_world: Se3) {
+        let T_keyframe_world = self.map.keyframes.last().map(|k| k.T_cam_world);
+        self.placed.push(Placed {
+            time,
+            keyframe: self.map.keyframes.len().saturating_sub(1),
+            T_cam_keyframe: T_cam_world * T_keyframe_world.unwrap_or_default().inverse(),
+        });
+    }
+}
