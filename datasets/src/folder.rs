@@ -403,8 +403,12 @@ fn read_times(path: &Path) -> Result<Vec<f64>, DataError> {
     lines.map(|(i, line)| number(path, i, line)).collect()
 }
 
-/// Planar truth, a header and then `time,x,y[,...]`, in the order that the header gives.
-fn read_planar(path: &Path) -> Result<Trajectory, DataError> {
+/// Planar truth (`gt.csv`): a header, then `time,x,y[,...]` in the order that the header gives. Poses
+/// stand with z = 0 and no rotation.
+///
+/// # Errors
+/// When the file cannot be read, a column is missing, or a cell is no number.
+pub fn read_planar(path: &Path) -> Result<Trajectory, DataError> {
     let text = std::fs::read_to_string(path).map_err(DataError::io(path))?;
     let mut lines = text
         .lines()

@@ -23,7 +23,7 @@ pub mod synth;
 mod write_folder;
 
 pub use error::DataError;
-pub use folder::Folder;
+pub use folder::{Folder, read_planar};
 pub use image_file::read_rgb;
 pub use open::{FORMATS, open};
 pub use prefetch::{Prefetch, prefetch};

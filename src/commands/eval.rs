@@ -1,10 +1,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{disparity_file, open};
+use barchan_datasets::{disparity_file, open, read_planar};
 use barchan_eval::disparity::DisparityTally;
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
-use barchan_geometry::{Se3, StampedPose, Trajectory};
+use barchan_geometry::Trajectory;
 use clap::{Parser, Subcommand};
 
 use crate::output::Output;
@@ -115,39 +115,10 @@ fn read_trajectory(path: &Path) -> Result<Trajectory> {
         .find(|l| !l.is_empty() && !l.starts_with('#'))
         .unwrap_or_default();
     if first.contains(',') {
-        return read_csv(path, &text);
+        return Ok(read_planar(path)?);
     }
     Ok(match first.split_whitespace().count() {
         12 => Trajectory::read_kitti(path, None)?,
         _ => Trajectory::read_tum(path)?,
     })
-}
-
-/// `time,x,y[,...]` with a header: planar positions.
-fn read_csv(path: &Path, text: &str) -> Result<Trajectory> {
-    let mut poses = Vec::new();
-    for (i, line) in text
-        .lines()
-        .enumerate()
-        .skip(1)
-        .filter(|(_, l)| !l.trim().is_empty())
-    {
-        let numbers: Vec<f64> = line
-            .split(',')
-            .take(3)
-            .map_while(|w| w.trim().parse().ok())
-            .collect();
-        let [time, x, y] = numbers[..] else {
-            bail!(
-                "{}:{}: expected time,x,y and found \"{line}\"",
-                path.display(),
-                i + 1
-            );
-        };
-        poses.push(StampedPose {
-            time,
-            T_world_cam: Se3::translation(x, y, 0.0),
-        });
-    }
-    Ok(Trajectory { poses })
 }

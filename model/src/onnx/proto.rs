@@ -106,10 +106,10 @@ impl Attribute {
             ..Self::default()
         }
     }
-    pub fn ints(name: &str, values: impl IntoIterator<Item = usize>) -> Self {
+    pub fn ints(name: &str, values: &[usize]) -> Self {
         Self {
             name: name.into(),
-            ints: values.into_iter().map(|v| v as i64).collect(),
+            ints: values.iter().map(|v| *v as i64).collect(),
             kind: 7,
             ..Self::default()
         }

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use burn::module::Param;
 use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose2d, ConvTranspose3d};
 use burn::nn::{PaddingConfig2d, PaddingConfig3d};
 use burn::tensor::Tensor;
@@ -78,23 +79,29 @@ impl GraphWriter {
         name.to_owned()
     }
 
+    /// A learned convolution; `pads` are those before every axis, then those after.
     fn convolution<const D: usize>(
         &mut self,
         op: &str,
         name: &str,
-        weight: &Tensor<D>,
-        bias: Option<Tensor<1>>,
+        weight: &Param<Tensor<D>>,
+        bias: &Option<Param<Tensor<1>>>,
+        [kernel, stride, pads]: [&[usize]; 3],
         x: &str,
-        attributes: Vec<Attribute>,
     ) -> String {
         let mut inputs = vec![
             x.to_owned(),
-            self.parameter(&format!("{name}.weight"), weight),
+            self.parameter(&format!("{name}.weight"), &weight.val()),
         ];
         if let Some(bias) = bias {
-            inputs.push(self.parameter(&format!("{name}.bias"), &bias));
+            inputs.push(self.parameter(&format!("{name}.bias"), &bias.val()));
         }
         let inputs: Vec<&str> = inputs.iter().map(String::as_str).collect();
+        let attributes = vec![
+            Attribute::ints("kernel_shape", kernel),
+            Attribute::ints("strides", stride),
+            Attribute::ints("pads", pads),
+        ];
         self.node(name, op, &inputs, attributes)
     }
 
@@ -134,64 +141,36 @@ impl Ops for GraphWriter {
     type Volume = String;
 
     fn conv2d(&mut self, name: &str, layer: &Conv2d, x: &String) -> String {
-        let attributes = vec![
-            Attribute::ints("kernel_shape", layer.kernel_size),
-            Attribute::ints("strides", layer.stride),
-            Attribute::ints("pads", padding_2d(&layer.padding)),
+        let shape = [
+            &layer.kernel_size[..],
+            &layer.stride,
+            &padding_2d(&layer.padding),
         ];
-        self.convolution(
-            "Conv",
-            name,
-            &layer.weight.val(),
-            layer.bias.as_ref().map(|b| b.val()),
-            x,
-            attributes,
-        )
+        self.convolution("Conv", name, &layer.weight, &layer.bias, shape, x)
     }
     fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &String) -> String {
-        let attributes = vec![
-            Attribute::ints("kernel_shape", layer.kernel_size),
-            Attribute::ints("strides", layer.stride),
-            Attribute::ints("pads", both_ends(&layer.padding)),
+        let shape = [
+            &layer.kernel_size[..],
+            &layer.stride,
+            &both_ends(&layer.padding),
         ];
-        self.convolution(
-            "ConvTranspose",
-            name,
-            &layer.weight.val(),
-            layer.bias.as_ref().map(|b| b.val()),
-            x,
-            attributes,
-        )
+        self.convolution("ConvTranspose", name, &layer.weight, &layer.bias, shape, x)
     }
     fn conv3d(&mut self, name: &str, layer: &Conv3d, x: &String) -> String {
-        let attributes = vec![
-            Attribute::ints("kernel_shape", layer.kernel_size),
-            Attribute::ints("strides", layer.stride),
-            Attribute::ints("pads", both_ends(&padding_3d(&layer.padding))),
+        let shape = [
+            &layer.kernel_size[..],
+            &layer.stride,
+            &both_ends(&padding_3d(&layer.padding)),
         ];
-        self.convolution(
-            "Conv",
-            name,
-            &layer.weight.val(),
-            layer.bias.as_ref().map(|b| b.val()),
-            x,
-            attributes,
-        )
+        self.convolution("Conv", name, &layer.weight, &layer.bias, shape, x)
     }
     fn conv_transpose3d(&mut self, name: &str, layer: &ConvTranspose3d, x: &String) -> String {
-        let attributes = vec![
-            Attribute::ints("kernel_shape", layer.kernel_size),
-            Attribute::ints("strides", layer.stride),
-            Attribute::ints("pads", both_ends(&layer.padding)),
+        let shape = [
+            &layer.kernel_size[..],
+            &layer.stride,
+            &both_ends(&layer.padding),
         ];
-        self.convolution(
-            "ConvTranspose",
-            name,
-            &layer.weight.val(),
-            layer.bias.as_ref().map(|b| b.val()),
-            x,
-            attributes,
-        )
+        self.convolution("ConvTranspose", name, &layer.weight, &layer.bias, shape, x)
     }
     fn fixed_conv2d(&mut self, name: &str, kernel: &Kernel, stride: usize, x: &String) -> String {
         let weight = self.unique(&format!("{name}.kernel"));
@@ -201,8 +180,8 @@ impl Ops for GraphWriter {
             kernel.data.iter().copied(),
         ));
         let attributes = vec![
-            Attribute::ints("kernel_shape", [kernel.shape[2], kernel.shape[3]]),
-            Attribute::ints("strides", [stride; 2]),
+            Attribute::ints("kernel_shape", &kernel.shape[2..]),
+            Attribute::ints("strides", &[stride; 2]),
         ];
         self.node(name, "Conv", &[x, &weight], attributes)
     }
