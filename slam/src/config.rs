@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SlamConfig {
-    /// Key points looked for in each image.
+    /// Key points asked for in each image. The quadtree that spreads them gives up to half as many more.
     pub features: usize,
     /// Smallest brightness step of a corner, of 255.
     pub corner_threshold: f32,
@@ -50,7 +50,7 @@ pub struct SlamConfig {
 impl Default for SlamConfig {
     fn default() -> Self {
         Self {
-            features: 1200,
+            features: 900,
             corner_threshold: 5.0,
             nndr: 0.75,
             max_hamming: 64,

@@ -155,27 +155,26 @@ fn refine_disparity([left, right]: [&Plane; 2], keypoint: &Keypoint, coarse: f64
     if !(inside(u, 0) && inside(u_right, REACH) && v >= RADIUS && v + RADIUS < height) {
         return None;
     }
+    const SIDE: usize = 2 * RADIUS as usize + 1;
     let window = |image: &Plane, x: i64| {
-        let mut values = [0.0f64; 121];
-        let mut k = 0;
-        for dy in -RADIUS..=RADIUS {
-            for dx in -RADIUS..=RADIUS {
-                values[k] = f64::from(image.as_raw()[((v + dy) * width + x + dx) as usize]);
-                k += 1;
-            }
+        let mut values = [0.0f32; SIDE * SIDE];
+        for (row, dy) in values.chunks_exact_mut(SIDE).zip(-RADIUS..) {
+            let start = ((v + dy) * width + x - RADIUS) as usize;
+            row.copy_from_slice(&image.as_raw()[start..start + SIDE]);
         }
-        let mean = values.iter().sum::<f64>() / 121.0;
+        let mean = values.iter().sum::<f32>() / values.len() as f32;
         values.iter_mut().for_each(|value| *value -= mean);
         values
     };
+    let product = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let reference = window(left, u);
-    let energy = |w: &[f64; 121]| w.iter().map(|v| v * v).sum::<f64>();
-    let reference_energy = energy(&reference);
-    let scores: [f64; 2 * REACH as usize + 1] = std::array::from_fn(|k| {
-        let other = window(right, u_right + k as i64 - REACH);
-        let product: f64 = reference.iter().zip(&other).map(|(a, b)| a * b).sum();
-        product / (reference_energy * energy(&other)).sqrt().max(1e-9)
-    });
+    let energy = product(&reference, &reference);
+    let mut scores = [0.0f64; 2 * REACH as usize + 1];
+    for (score, shift) in scores.iter_mut().zip(-REACH..) {
+        let other = window(right, u_right + shift);
+        let norm = (energy * product(&other, &other)).sqrt().max(1e-9);
+        *score = f64::from(product(&reference, &other) / norm);
+    }
     let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]))?;
     if best == 0 || best + 1 == scores.len() || scores[best] < 0.6 {
         return None;
