@@ -93,6 +93,9 @@ pub struct Args {
     /// Augmentation: largest shift of a colour channel
     #[arg(long, default_value_t = Augmentation::default().channel)]
     channel: f32,
+    /// Augmentation: most pixels that are added to every disparity
+    #[arg(long, default_value_t = Augmentation::default().disparity)]
+    add_disparity: usize,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -236,6 +239,7 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
             brightness: args.brightness,
             contrast: args.contrast,
             channel: args.channel,
+            disparity: args.add_disparity,
         },
     };
     let net = initial_net(&mut config, args.max_disparity)?;

@@ -14,6 +14,9 @@ pub struct Augmentation {
     pub contrast: f32,
     /// Each channel is shifted by up to this.
     pub channel: f32,
+    /// The right crop is taken up to this many pixels further right, which adds as much to every
+    /// disparity: a network that saw only far ground learns near ground too.
+    pub disparity: usize,
 }
 
 impl Default for Augmentation {
@@ -23,6 +26,7 @@ impl Default for Augmentation {
             brightness: 0.1,
             contrast: 0.2,
             channel: 0.05,
+            disparity: 48,
         }
     }
 }

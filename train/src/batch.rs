@@ -46,10 +46,12 @@ impl Batch {
         let (mut truth, mut known) = (vec![], vec![]);
         for (frame, disparity) in samples {
             let (w, h) = frame.left.dimensions();
-            let x0 = rng.random_range(0..=w as usize - width);
+            let room = w as usize - width;
+            let further = rng.random_range(0..=augmentation.map_or(0, |a| a.disparity).min(room));
+            let x0 = rng.random_range(0..=room - further);
             let y0 = rng.random_range(0..=h as usize - height);
             let mut left = planar(&frame.left, [x0, y0], [width, height]);
-            let mut right = planar(&frame.right, [x0, y0], [width, height]);
+            let mut right = planar(&frame.right, [x0 + further, y0], [width, height]);
             images[0].extend(&left);
             images[1].extend(&right);
             if let Some(augmentation) = augmentation {
@@ -60,7 +62,13 @@ impl Batch {
             if let Some(disparity) = disparity {
                 for y in y0..y0 + height {
                     let row = &disparity.as_raw()[y * w as usize..][x0..x0 + width];
-                    truth.extend(row.iter().map(|d| if d.is_finite() { *d } else { 0.0 }));
+                    truth.extend(row.iter().map(|d| {
+                        if d.is_finite() {
+                            d + further as f32
+                        } else {
+                            0.0
+                        }
+                    }));
                     known.extend(row.iter().map(|d| f32::from(d.is_finite())));
                 }
             }
@@ -93,5 +101,70 @@ impl Batch {
                 device,
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    /// Every pixel's red is its column over 100, so a crop tells where it was taken.
+    fn sample() -> Sample {
+        let image = |shift: f32| {
+            Rgb::from_fn(64, 40, |x, _| {
+                image::Rgb([(x as f32 + shift) / 100.0, 0.0, 0.0])
+            })
+        };
+        let frame = StereoFrame {
+            index: 0,
+            name: "a".into(),
+            time: 0.0,
+            left: image(0.0),
+            right: image(7.0),
+        };
+        (frame, Some(Plane::from_pixel(64, 40, image::Luma([7.0]))))
+    }
+
+    #[test]
+    fn truth_follows_the_disparity_that_augmentation_adds() {
+        let device = Device::flex();
+        let plain = Augmentation {
+            noise: 0.0,
+            brightness: 0.0,
+            contrast: 0.0,
+            channel: 0.0,
+            disparity: 20,
+        };
+        let mut added = Vec::new();
+        for seed in 0..20 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let batch = Batch::crop(&[sample()], [32, 32], Some(&plain), &mut rng, &device);
+            let red = |t: &Tensor<4>| t.to_data().iter::<f32>().next().unwrap() * 100.0;
+            let (truth, known) = batch.truth.unwrap();
+            let truth = truth.to_data().iter::<f32>().next().unwrap();
+            // At the same place of both crops the right one shows what lies `truth` columns further.
+            assert!((red(&batch.right) - red(&batch.left) - truth).abs() < 1e-3);
+            assert_eq!(known.mean().into_scalar::<f32>(), 1.0);
+            added.push(truth - 7.0);
+        }
+        assert!(
+            added.iter().any(|a| *a > 5.0) && added.iter().all(|a| (0.0..=20.0).contains(a)),
+            "{added:?}"
+        );
+    }
+
+    #[test]
+    fn a_crop_shrinks_to_a_small_image() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let batch = Batch::crop(
+            &[sample()],
+            [192, 320],
+            Some(&Augmentation::default()),
+            &mut rng,
+            &Device::flex(),
+        );
+        assert_eq!(batch.left.dims(), [1, 3, 40, 64]);
     }
 }

@@ -68,7 +68,8 @@ impl Loss {
     /// Eq. 1 for images `[B, 3, H, W]` in 0..=1 and disparity `[B, 1, H, W]` in pixels.
     ///
     /// Pixels whose match falls outside the right image cannot be judged and are left out of the
-    /// photometric terms. Disparity enters eq. 4 and 5 as a share of `max_disparity`: in pixels the
+    /// photometric terms, and of the magnitude term too: with nothing to hold against it, that one
+    /// would draw the whole left border to infinity. Disparity enters eq. 4 and 5 as a share of `max_disparity`: in pixels the
     /// paper's weights would let the magnitude term outweigh the images.
     pub fn self_supervised(
         &self,
@@ -79,10 +80,10 @@ impl Loss {
     ) -> LossTerms {
         let (warped, inside) = warp_right_to_left(right, disparity);
         let ssim = masked_mean(structural_dissimilarity(left, &warped), shrink(&inside));
-        let l1 = masked_mean((left.clone() - warped).abs(), inside);
+        let l1 = masked_mean((left.clone() - warped).abs(), inside.clone());
         let share = disparity.clone() / max_disparity as f32;
         let smooth = edge_aware_smoothness(left, &share);
-        let magnitude = share.abs().mean();
+        let magnitude = masked_mean(share.abs(), inside);
         let total = ssim.clone() * self.ssim
             + l1.clone() * self.l1
             + smooth.clone() * self.smooth
