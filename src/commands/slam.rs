@@ -53,6 +53,7 @@ struct Summary {
     tracked: usize,
     keyframes: usize,
     loops: usize,
+    restarts: Vec<usize>,
     points: usize,
     ms_track_median: f64,
     ms_track_p95: f64,
@@ -109,6 +110,12 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     }
 
     let result = slam.finish();
+    if !result.restarts.is_empty() {
+        output.notice(&format!(
+            "the map began anew at key frames {:?}: the parts are not joined, and how they lie to each other is a guess",
+            result.restarts
+        ));
+    }
     write_result(&out, &result)?;
     let (ms_track_median, ms_track_p95) = percentiles(track_ms);
     let summary = Summary {
@@ -116,6 +123,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         tracked,
         keyframes: result.keyframes.len(),
         loops: 0,
+        restarts: result.restarts.clone(),
         points: result.map.points.len(),
         ms_track_median,
         ms_track_p95,

@@ -93,9 +93,9 @@ pub struct Args {
     /// Augmentation: largest shift of a colour channel
     #[arg(long, default_value_t = Augmentation::default().channel)]
     channel: f32,
-    /// Augmentation: most pixels that are added to every disparity
-    #[arg(long, default_value_t = Augmentation::default().disparity)]
-    add_disparity: usize,
+    /// Augmentation: most pixels that are added to every disparity [default: 48 with --supervised, else 0]
+    #[arg(long)]
+    add_disparity: Option<usize>,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -239,7 +239,9 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
             brightness: args.brightness,
             contrast: args.contrast,
             channel: args.channel,
-            disparity: args.add_disparity,
+            disparity: args
+                .add_disparity
+                .unwrap_or(if args.supervised { 48 } else { 0 }),
         },
     };
     let net = initial_net(&mut config, args.max_disparity)?;

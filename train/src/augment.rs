@@ -15,7 +15,8 @@ pub struct Augmentation {
     /// Each channel is shifted by up to this.
     pub channel: f32,
     /// The right crop is taken up to this many pixels further right, which adds as much to every
-    /// disparity: a network that saw only far ground learns near ground too.
+    /// disparity: a network that saw only far ground learns near ground too. For supervised training,
+    /// which knows what then leaves the search range; without truth such pixels would teach nonsense.
     pub disparity: usize,
 }
 
@@ -26,7 +27,7 @@ impl Default for Augmentation {
             brightness: 0.1,
             contrast: 0.2,
             channel: 0.05,
-            disparity: 48,
+            disparity: 0,
         }
     }
 }
