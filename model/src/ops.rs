@@ -87,6 +87,8 @@ pub trait Ops {
     fn sqrt(&mut self, x: &Self::Map) -> Self::Map;
     /// Exponential.
     fn exp(&mut self, x: &Self::Map) -> Self::Map;
+    /// The largest whole number not above.
+    fn floor(&mut self, x: &Self::Map) -> Self::Map;
     /// Magnitude.
     fn abs(&mut self, x: &Self::Map) -> Self::Map;
     /// `x` limited to `low..=high`.
@@ -196,6 +198,9 @@ impl Ops for Execute {
     }
     fn exp(&mut self, x: &Tensor<4>) -> Tensor<4> {
         x.clone().exp()
+    }
+    fn floor(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        x.clone().floor()
     }
     fn abs(&mut self, x: &Tensor<4>) -> Tensor<4> {
         x.clone().abs()

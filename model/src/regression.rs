@@ -75,9 +75,16 @@ impl Regression {
         let confidence = up_sample(ops, "confidence", &confidence);
 
         // The mixed moments are those of the mixed distribution, so their variance includes the
-        // disagreement of the neighbours. The floor is a twentieth of a pixel.
+        // disagreement of the neighbours. A certain answer between two bins needs both, a share f of
+        // the upper one, and so has a variance of f (1 - f) that says nothing of doubt: it is taken
+        // off. The floor is a twentieth of a pixel.
         let mean2 = ops.mul(&mean, &mean);
         let variance = ops.sub(&square, &mean2);
+        let whole = ops.floor(&mean);
+        let share = ops.sub(&mean, &whole);
+        let rest = ops.affine(-1.0, 1.0, &share);
+        let between = ops.mul(&share, &rest);
+        let variance = ops.sub(&variance, &between);
         let variance = ops.clamp(1.5e-4, f32::MAX, &variance);
         let sigma = ops.sqrt(&variance);
         Prediction {

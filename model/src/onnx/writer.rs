@@ -241,6 +241,9 @@ impl Ops for GraphWriter {
     fn exp(&mut self, x: &String) -> String {
         self.plain("Exp", &[x], vec![])
     }
+    fn floor(&mut self, x: &String) -> String {
+        self.plain("Floor", &[x], vec![])
+    }
     fn abs(&mut self, x: &String) -> String {
         self.plain("Abs", &[x], vec![])
     }
