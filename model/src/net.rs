@@ -1,4 +1,6 @@
-use burn::module::Module;
+use std::sync::{Mutex, PoisonError};
+
+use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -109,6 +111,17 @@ pub struct StereoNet {
     config: NetConfig,
 }
 
+static DRAWING: Mutex<()> = Mutex::new(());
+
+/// Burn draws a parameter when it is first looked at: this looks at all, in their order.
+struct Draw;
+
+impl ModuleVisitor for Draw {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        param.val();
+    }
+}
+
 impl StereoNet {
     /// A network with random weights, reproducible by seed.
     ///
@@ -116,14 +129,18 @@ impl StereoNet {
     /// When the configuration describes no network.
     pub fn init(config: &NetConfig, seed: u64, device: &Device) -> Result<Self, ModelError> {
         config.check()?;
+        // The device's generator is the process's: nobody else may draw between seed and last draw.
+        let _drawing = DRAWING.lock().unwrap_or_else(PoisonError::into_inner);
         device.seed(seed);
         let input = config.groups + CENSUS_CHANNELS;
-        Ok(Self {
+        let net = Self {
             features: Features::init(config.features, config.matching, device),
             aggregation: Aggregation::init(input, config.aggregation, device),
             regression: Regression::init(config.features[1], config.up_sampling, device),
             config: config.clone(),
-        })
+        };
+        net.visit(&mut Draw);
+        Ok(net)
     }
 
     /// The same weights searching another range: every layer is a convolution over disparity, so
