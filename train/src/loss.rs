@@ -44,9 +44,9 @@ pub struct LossTerms<T = Tensor<1>> {
     pub ssim: T,
     /// Mean absolute difference of colours, eq. 3.
     pub l1: T,
-    /// Edge-aware smoothness of the disparity, in units of the largest disparity per pixel.
+    /// Edge-aware smoothness of the disparity, as a share of the width per pixel.
     pub smooth: T,
-    /// Mean disparity in units of the largest, eq. 5.
+    /// Mean disparity as a share of the width, eq. 5.
     pub magnitude: T,
 }
 
@@ -69,19 +69,18 @@ impl Loss {
     ///
     /// Pixels whose match falls outside the right image cannot be judged and are left out of the
     /// photometric terms, and of the magnitude term too: with nothing to hold against it, that one
-    /// would draw the whole left border to infinity. Disparity enters eq. 4 and 5 as a share of `max_disparity`: in pixels the
-    /// paper's weights would let the magnitude term outweigh the images.
+    /// would draw the whole left border to infinity. Disparity enters eq. 4 and 5 as a share of the image's width (as Godard 2017
+    /// has it): in pixels the paper's weights would let the magnitude term outweigh the images.
     pub fn self_supervised(
         &self,
         left: &Tensor<4>,
         right: &Tensor<4>,
         disparity: &Tensor<4>,
-        max_disparity: usize,
     ) -> LossTerms {
         let (warped, inside) = warp_right_to_left(right, disparity);
         let ssim = masked_mean(structural_dissimilarity(left, &warped), shrink(&inside));
         let l1 = masked_mean((left.clone() - warped).abs(), inside.clone());
-        let share = disparity.clone() / max_disparity as f32;
+        let share = disparity.clone() / disparity.dims()[3] as f32;
         let smooth = edge_aware_smoothness(left, &share);
         let magnitude = masked_mean(share.abs(), inside);
         let total = ssim.clone() * self.ssim
@@ -196,7 +195,7 @@ mod tests {
     #[test]
     fn gradient_of_the_loss_matches_finite_differences() {
         let (left, right, disparity) = scene();
-        let total = |d: &Tensor<4>| Loss::default().self_supervised(&left, &right, d, 16).total;
+        let total = |d: &Tensor<4>| Loss::default().self_supervised(&left, &right, d).total;
         let d = disparity.clone().require_grad();
         let gradients = total(&d).backward();
         let gradient: Vec<f32> = d

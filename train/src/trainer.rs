@@ -302,12 +302,10 @@ impl Trainer {
         );
 
         let prediction = self.net.forward(batch.seen_left, batch.seen_right);
-        let terms = self.config.loss.self_supervised(
-            &batch.left,
-            &batch.right,
-            &prediction.disparity,
-            self.config.net.max_disparity,
-        );
+        let terms =
+            self.config
+                .loss
+                .self_supervised(&batch.left, &batch.right, &prediction.disparity);
         let total = match (&batch.truth, self.config.supervised) {
             (Some((truth, known)), true) => {
                 // What the network cannot say it is not asked.
@@ -366,7 +364,7 @@ impl Trainer {
             let terms = self
                 .config
                 .loss
-                .self_supervised(&left, &right, &disparity, self.config.net.max_disparity)
+                .self_supervised(&left, &right, &disparity)
                 .values();
             ssim += terms.ssim;
             l1 += terms.l1;
