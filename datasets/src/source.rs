@@ -1,7 +1,7 @@
 use barchan_geometry::{RectifiedRig, Trajectory};
 use image::{ImageBuffer, Luma, Rgb32FImage};
 
-use crate::DataError;
+use crate::{DataError, Sensors};
 
 /// A colour image, `f32` in 0..=1. Grey sources have three equal channels.
 pub type Rgb = Rgb32FImage;
@@ -26,8 +26,15 @@ pub struct StereoFrame {
 
 /// A sequence of rectified stereo pairs. One implementation per format.
 pub trait StereoSource: Send + Sync {
-    /// The rig that every frame obeys.
+    /// The rig that every frame obeys; of a source whose pairs differ in size or calibration
+    /// (benchmarks), that of the first.
     fn rig(&self) -> &RectifiedRig;
+
+    /// The rig that frame `index` obeys, without reading it.
+    fn frame_rig(&self, index: usize) -> &RectifiedRig {
+        let _ = index;
+        self.rig()
+    }
 
     /// How many frames there are.
     fn len(&self) -> usize;
@@ -57,9 +64,24 @@ pub trait StereoSource: Send + Sync {
         Ok(None)
     }
 
+    /// True disparity of the right image of frame `index` (a point at column `x` of it is at
+    /// `x + d` in the left one), NaN where not known.
+    ///
+    /// # Errors
+    /// When there is truth but it cannot be read.
+    fn true_disparity_right(&self, index: usize) -> Result<Option<Plane>, DataError> {
+        let _ = index;
+        Ok(None)
+    }
+
     /// The true trajectory of the left camera, one pose a frame, when it is known. Planar truth
     /// (`gt.csv`) stands with z = 0 and no rotation.
     fn true_trajectory(&self) -> Option<&Trajectory> {
+        None
+    }
+
+    /// What else the rover measured, when the source has any of it.
+    fn sensors(&self) -> Option<&Sensors> {
         None
     }
 }
