@@ -45,8 +45,8 @@ lint: ## format, clippy and documentation, warnings denied
 	cargo clippy $(CARGO_BUILD) --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_BUILD) --no-deps
 
-bench: onnxruntime ## criterion benches
-	cargo bench --workspace $(CARGO_FLAGS)
+bench: onnxruntime ## timings of the main job, step by step
+	cargo bench --workspace --bench main_job $(CARGO_FLAGS)
 
 peers: build onnxruntime $(PEERS)/ready ## outputs against other people's programs: ONNX Runtime, evo, GDAL, OpenCV
 	$(PEERS)/bin/python tests/peers/run.py --barchan "$(BARCHAN)"
