@@ -1,33 +1,45 @@
-//! Opening data for a command: format, and whether the rows of its pairs correspond.
+//! Opening data for a command: format, correction, and whether its pairs are fit for stereo.
 
-use anyhow::Result;
-use barchan_datasets::{StereoSource, open, rows};
+use anyhow::{Result, bail};
+use barchan_datasets::check::{Fault, check};
+use barchan_datasets::{Corrected, StereoSource, open};
 
 use crate::output::Output;
 
-/// Opens `spec` and measures its row offset; pairs whose rows are off are corrected, with a line
-/// that says so. Rendered pairs are exact and not measured.
-pub fn open_checked(spec: &str, output: &Output) -> Result<Box<dyn StereoSource>> {
+/// Which data, and whether to trust it.
+#[derive(clap::Args)]
+pub struct Unchecked {
+    /// Take the pairs as they are: no calibration check, no correction of rows on the fly
+    #[arg(long)]
+    pub no_check: bool,
+}
+
+/// Opens `spec` and checks its pairs. Rows that are off are corrected on the fly, with a line that
+/// says so; swapped or slipped images stop the command; anything else is said. Rendered pairs are
+/// exact and not checked.
+pub fn open_checked(
+    spec: &str,
+    unchecked: &Unchecked,
+    output: &Output,
+) -> Result<Box<dyn StereoSource>> {
     let source = open(spec)?;
-    if spec.starts_with("synth") {
+    if unchecked.no_check || spec.starts_with("synth") {
         return Ok(source);
     }
-    let measured = rows::measure_row_offset(source.as_ref())?;
-    if rows::needs_correction(&measured) {
-        output.notice(&format!(
-            "{spec}: the right images lie {:.2} px {} than the left (spread {:.2} px over {} matches); rows are corrected",
-            measured.offset.abs(),
-            if measured.offset > 0.0 { "lower" } else { "higher" },
-            measured.spread,
-            measured.matches,
-        ));
-        return Ok(Box::new(rows::RowCorrected::new(source, measured.offset)));
+    let report = check(source.as_ref())?;
+    for finding in &report.findings {
+        match finding.fault {
+            Fault::Swapped | Fault::Slipped => bail!(
+                "{spec}: {finding}\n  cure: `barchan data check {spec} --fix` writes the correction beside the images; --no-check takes them as they are"
+            ),
+            Fault::RowOffset | Fault::Pitch | Fault::Yaw | Fault::Roll | Fault::Scale => {
+                output.notice(&format!("{spec}: {finding}; rows are corrected"));
+            }
+            _ => output.notice(&format!("{spec}: {finding}")),
+        }
     }
-    if measured.matches < 30 {
-        output.notice(&format!(
-            "{spec}: only {} patches match between left and right: are the cameras swapped, or the images not of one moment?",
-            measured.matches
-        ));
+    match report.correction {
+        Some(correction) => Ok(Box::new(Corrected::new(source, correction)?)),
+        None => Ok(source),
     }
-    Ok(source)
 }

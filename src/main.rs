@@ -60,7 +60,11 @@ fn main() -> ExitCode {
         Command::Map(args) => commands::map::run(args, &output),
         Command::Raster(args) => commands::raster::run(args, &output),
         Command::Eval(args) => commands::eval::run(args, &output),
-        Command::Data(args) => commands::data::run(args, &output),
+        Command::Data(args) => match commands::data::run(args, &output) {
+            // A check that found something is no error, and scripts want to know.
+            Ok(false) => return ExitCode::from(1),
+            other => other.map(|_| ()),
+        },
         Command::Doctor(args) => commands::doctor::run(args, &output, runtime),
     };
     match result {

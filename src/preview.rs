@@ -1,7 +1,11 @@
-//! Pictures of disparity for people.
+//! Pictures for people.
 
-use barchan_datasets::{Plane, Rgb};
+use barchan_datasets::check::Report;
+use barchan_datasets::{Plane, Rgb, StereoFrame};
+use barchan_geometry::RectifiedRig;
+use barchan_geometry::nalgebra::{Matrix3, Vector3};
 use image::RgbImage;
+use image::imageops::{FilterType, replace, resize};
 
 /// The left image beside its disparity in colour: far is blue, near is red, unknown is black.
 /// `range` fixes the colours, so that the frames of a sequence compare.
@@ -10,20 +14,130 @@ pub fn disparity_beside_image(left: &Rgb, disparity: &Plane, range: (f32, f32)) 
     let (low, high) = range;
     RgbImage::from_fn(2 * width, height, |x, y| {
         if x < width {
-            return image::Rgb(
-                left.get_pixel(x, y)
-                    .0
-                    .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8),
-            );
+            return byte(left.get_pixel(x, y));
         }
         let d = disparity.get_pixel(x - width, y).0[0];
         if !d.is_finite() {
             return image::Rgb([0; 3]);
         }
-        let share = ((d - low) / (high - low).max(1e-6)).clamp(0.0, 1.0);
-        let colour = colorous::TURBO.eval_continuous(f64::from(share));
-        image::Rgb([colour.r, colour.g, colour.b])
+        turbo((d - low) / (high - low).max(1e-6))
     })
+}
+
+/// Left image, right image and true disparity (black where unknown) of each pair, a pair a row.
+pub fn contact_sheet(pairs: &[(StereoFrame, Option<Plane>)]) -> RgbImage {
+    /// Width of one picture, pixels.
+    const WIDTH: u32 = 400;
+    let tile = |image: &RgbImage| {
+        let height = (image.height() * WIDTH).div_ceil(image.width().max(1));
+        resize(image, WIDTH, height.max(1), FilterType::Triangle)
+    };
+    let rows: Vec<Vec<RgbImage>> = pairs
+        .iter()
+        .map(|(frame, truth)| {
+            let mut row = vec![tile(&bytes(&frame.left)), tile(&bytes(&frame.right))];
+            if let Some(truth) = truth {
+                let both = disparity_beside_image(&frame.left, truth, disparity_range(truth));
+                let (width, height) = frame.left.dimensions();
+                let disparity = image::imageops::crop_imm(&both, width, 0, width, height);
+                // Unknown and known pixels must not blend.
+                let height = row[0].height();
+                row.push(resize(
+                    &disparity.to_image(),
+                    WIDTH,
+                    height,
+                    FilterType::Nearest,
+                ));
+            }
+            row
+        })
+        .collect();
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(1) as u32;
+    let height: u32 = rows.iter().map(|row| row[0].height()).sum();
+    let mut sheet = RgbImage::new(columns * WIDTH, height.max(1));
+    let mut y = 0;
+    for row in &rows {
+        for (column, image) in row.iter().enumerate() {
+            replace(&mut sheet, image, (column as u32 * WIDTH).into(), y);
+        }
+        y += i64::from(row[0].height());
+    }
+    sheet
+}
+
+/// The matches of one frame: above, where they lie in the left and in the right image; below, how far
+/// rows of the right image are off, ten times as long, as they are and after correction. Green is
+/// within half a pixel, red beyond.
+pub fn row_errors(frame: &StereoFrame, rig: &RectifiedRig, report: &Report) -> RgbImage {
+    let (left, right) = (bytes(&frame.left), bytes(&frame.right));
+    let mut dark = left.clone();
+    dark.pixels_mut()
+        .for_each(|p| p.0 = p.0.map(|v| v / 2));
+    let (width, height) = left.dimensions();
+    let mut panels = [left, right, dark.clone(), dark];
+    let to_corrected = report
+        .rows
+        .and_then(|rows| rows.homography(rig).try_inverse())
+        .unwrap_or(Matrix3::identity());
+    // Marks that can be seen in a picture of any size.
+    let half = (width / 320).max(1) as i32;
+    for [[x, y], to] in &report.sample.matches {
+        let corrected = to_corrected * Vector3::new(to[0], to[1], 1.0);
+        let colour = turbo((x / f64::from(width)) as f32);
+        dot(&mut panels[0], *x, *y, half, colour);
+        dot(&mut panels[1], to[0], to[1], half, colour);
+        for (panel, row) in [(2, to[1]), (3, corrected.y / corrected.z)] {
+            let error = row - y;
+            let colour = if error.abs() <= 0.5 {
+                image::Rgb([90, 220, 90])
+            } else {
+                image::Rgb([255, 70, 60])
+            };
+            let length = (10.0 * error).abs().min(f64::from(height)) as i32;
+            for k in 0..=length {
+                dot(&mut panels[panel], *x, y + f64::from(k) * error.signum(), half - 1, colour);
+            }
+            dot(&mut panels[panel], *x, *y, half, colour);
+        }
+    }
+    let mut picture = RgbImage::new(2 * width, 2 * height);
+    for (k, panel) in panels.iter().enumerate() {
+        let (column, row) = (k as u32 % 2, k as u32 / 2);
+        replace(
+            &mut picture,
+            panel,
+            (column * width).into(),
+            (row * height).into(),
+        );
+    }
+    picture
+}
+
+fn dot(image: &mut RgbImage, x: f64, y: f64, half: i32, colour: image::Rgb<u8>) {
+    let (cx, cy) = (x.round() as i32, y.round() as i32);
+    for y in cy - half..=cy + half {
+        for x in cx - half..=cx + half {
+            if x >= 0 && y >= 0 && x < image.width() as i32 && y < image.height() as i32 {
+                image.put_pixel(x as u32, y as u32, colour);
+            }
+        }
+    }
+}
+
+fn bytes(image: &Rgb) -> RgbImage {
+    RgbImage::from_fn(image.width(), image.height(), |x, y| {
+        byte(image.get_pixel(x, y))
+    })
+}
+
+fn byte(pixel: &image::Rgb<f32>) -> image::Rgb<u8> {
+    image::Rgb(pixel.0.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8))
+}
+
+/// From blue at 0 to red at 1.
+fn turbo(share: f32) -> image::Rgb<u8> {
+    let colour = colorous::TURBO.eval_continuous(f64::from(share.clamp(0.0, 1.0)));
+    image::Rgb([colour.r, colour.g, colour.b])
 }
 
 /// The 2nd and 98th percentile of the known disparities; 0 to 1 where none is known.

@@ -10,6 +10,8 @@
 //!
 //! What it never does: match features, run a network or judge a result.
 
+pub mod check;
+mod correction;
 pub mod disparity_file;
 mod error;
 mod folder;
@@ -17,12 +19,12 @@ mod image_file;
 mod open;
 mod prefetch;
 mod resample;
-pub mod rows;
 mod sensors;
 mod source;
 pub mod synth;
 mod write_folder;
 
+pub use correction::{Corrected, Correction};
 pub use error::DataError;
 pub use folder::{Folder, read_planar};
 pub use image_file::read_rgb;

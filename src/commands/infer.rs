@@ -10,7 +10,7 @@ use barchan_terrain::{Cloud, DepthLimits};
 use clap::Parser;
 use serde::Serialize;
 
-use crate::data::open_checked;
+use crate::data::{Unchecked, open_checked};
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
 use crate::preview::{disparity_beside_image, disparity_range};
@@ -51,6 +51,8 @@ pub struct Args {
     /// Threads that work on one image; 0 leaves it to the engine
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    #[command(flatten)]
+    unchecked: Unchecked,
 }
 
 #[derive(Serialize)]
@@ -140,7 +142,7 @@ fn open_frames(args: &Args, output: &Output) -> Result<(Frames, Option<Rectified
     let Some(data) = &args.data else {
         bail!("give --data, or --left and --right");
     };
-    let source: Arc<dyn StereoSource> = open_checked(data, output)?.into();
+    let source: Arc<dyn StereoSource> = open_checked(data, &args.unchecked, output)?.into();
     let rig = *source.rig();
     let order = match &args.keyframes {
         None => (0..source.len()).collect(),

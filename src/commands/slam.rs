@@ -11,7 +11,7 @@ use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
 
-use crate::data::open_checked;
+use crate::data::{Unchecked, open_checked};
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
 
@@ -45,6 +45,8 @@ pub struct Args {
     /// Threads of the disparity engine; 0 leaves it to the engine
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    #[command(flatten)]
+    unchecked: Unchecked,
 }
 
 #[derive(Serialize)]
@@ -64,7 +66,7 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let config = configuration(&args)?;
-    let source: Arc<dyn StereoSource> = open_checked(&args.data, output)?.into();
+    let source: Arc<dyn StereoSource> = open_checked(&args.data, &args.unchecked, output)?.into();
     let engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     out.write("config.toml", toml::to_string(&config)?)?;

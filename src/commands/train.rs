@@ -7,7 +7,7 @@ use barchan_train::{Augmentation, DeviceName, Loss, RunDir, Schedule, TrainConfi
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
 
-use crate::data::open_checked;
+use crate::data::{Unchecked, open_checked};
 use crate::engine::load_net;
 use crate::output::Output;
 
@@ -96,6 +96,8 @@ pub struct Args {
     /// Augmentation: most pixels that are added to every disparity [default: 48 with --supervised, else 0]
     #[arg(long)]
     add_disparity: Option<usize>,
+    #[command(flatten)]
+    unchecked: Unchecked,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -279,10 +281,14 @@ fn initial_net(
         .transpose()?)
 }
 
-fn open_all(data: &[String], output: &Output) -> Result<Vec<Box<dyn StereoSource>>> {
+fn open_all(
+    data: &[String],
+    unchecked: &Unchecked,
+    output: &Output,
+) -> Result<Vec<Box<dyn StereoSource>>> {
     let sources: Vec<_> = data
         .iter()
-        .map(|spec| open_checked(spec, output))
+        .map(|spec| open_checked(spec, unchecked, output))
         .collect::<Result<_>>()?;
     if sources.iter().all(|s| s.is_empty()) {
         bail!("{}: no frames", data.join(", "));
