@@ -1,7 +1,7 @@
 //! Stereo sequences from disk or rendered: one file per format.
 //!
 //! What it is for: a [`StereoSource`] yields rectified [`StereoFrame`]s and, when it has it, truth.
-//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`rows`] measures whether the
+//! [`open`] finds the format ([`formats()`] lists them); [`load_rig`] reads the calibration of other tools; [`prefetch`] reads ahead on threads; [`rows`] measures whether the
 //! rows of a pair correspond at all; [`disparity_file`] reads and writes disparity images;
 //! [`write_folder`] writes any source as images on disk.
 //!
@@ -10,25 +10,34 @@
 //!
 //! What it never does: match features, run a network or judge a result.
 
+mod calibration;
 pub mod disparity_file;
 mod error;
-mod folder;
+mod formats;
 mod image_file;
+mod listing;
 mod open;
+mod pairs;
 mod prefetch;
 mod resample;
 pub mod rows;
 mod sensors;
 mod source;
 pub mod synth;
+mod text;
 mod write_folder;
 
+pub use calibration::{CALIBRATIONS, load_rig, load_rig_of_size};
 pub use error::DataError;
-pub use folder::{Folder, read_planar};
+pub use formats::folder::Folder;
 pub use image_file::read_rgb;
-pub use open::{FORMATS, open};
+pub use open::{formats, open};
+pub use pairs::PairSource;
 pub use prefetch::{Prefetch, prefetch};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
 pub use synth::Synth;
+pub use text::read_planar;
 pub use write_folder::write_folder;
+
+use formats::folder;
