@@ -45,7 +45,12 @@ pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
         return Ok(Box::new((format.open)(Path::new(rest))?));
     }
     if !path.is_dir() {
-        let message = format!("no such folder. A dataset is a PATH or one of {}", known());
+        let what = if path.exists() {
+            "a file, not a folder"
+        } else {
+            "no such folder"
+        };
+        let message = format!("{what}. A dataset is a PATH or one of {}", known());
         return Err(layout(spec, &message));
     }
     if let Some(format) = ON_DISK.iter().find(|f| (f.detect)(path)) {

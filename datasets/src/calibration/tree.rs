@@ -119,6 +119,9 @@ fn parse_xml(text: &str) -> Result<Node, String> {
             .collect::<Result<_, String>>()?;
         Ok(if named.is_empty() {
             Node::Word(element.text().unwrap_or_default().trim().to_owned())
+        } else if named.iter().all(|(name, _)| name == "_") {
+            // How OpenCV writes lists.
+            Node::List(named.into_iter().map(|(_, item)| item).collect())
         } else {
             Node::Map(named)
         })
@@ -292,9 +295,13 @@ mod tests {
             assert_eq!(m1.get(&["rows"]), Some(&word("1")));
             assert_eq!(root.get(&["imageWidth"]), Some(&word("64")));
         }
-        let nested = parse_yaml("K: [[1, 2], [3, 4]]").unwrap();
-        let numbers = nested.get(&["k"]).unwrap().numbers();
-        assert_eq!(numbers, Some(vec![1.0, 2.0, 3.0, 4.0]));
+        for nested in [
+            parse_yaml("K: [[1, 2], [3, 4]]"),
+            parse_xml("<a><K><_>1</_><_>2 3</_><_>4</_></K></a>"),
+        ] {
+            let numbers = nested.unwrap().get(&["k"]).unwrap().numbers();
+            assert_eq!(numbers, Some(vec![1.0, 2.0, 3.0, 4.0]));
+        }
     }
 
     #[test]

@@ -400,6 +400,57 @@ mod tests {
         );
     }
 
+    #[test]
+    fn another_tools_calibration_stands_in_for_rig_toml_with_the_size_of_the_images() {
+        let dir = dataset(&["a"], &["a"]);
+        let p = |shift: f64| format!("9 0 4 {shift} 0 9 3 0 0 0 1 0");
+        let kitti = format!("P0: {}\nP1: {}\n", p(0.0), p(-1.8));
+        std::fs::write(dir.path().join("calib.txt"), kitti).unwrap();
+        assert_eq!(Folder::open(dir.path()).unwrap().rig().baseline, 0.1);
+        std::fs::remove_file(dir.path().join("rig.toml")).unwrap();
+        let rig = *Folder::open(dir.path()).unwrap().rig();
+        assert!((rig.baseline - 0.2).abs() < 1e-12);
+        assert_eq!((rig.width, rig.height, rig.fx, rig.cx), (8, 6, 9.0, 4.0));
+        std::fs::remove_file(dir.path().join("calib.txt")).unwrap();
+        let message = error(dir.path());
+        for name in [
+            "rig.toml",
+            "calib.txt",
+            "left.yaml + right.yaml",
+            "stereo.xml",
+        ] {
+            assert!(message.contains(name), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_calibration_of_another_size_is_refused_before_its_maps_are_made() {
+        let dir = dataset(&["a"], &["a"]);
+        let text = RIG
+            .replace("rectified = true", "rectified = false")
+            .replace("width = 8", "width = 65535")
+            .replace("height = 6", "height = 65535");
+        std::fs::write(dir.path().join("rig.toml"), text).unwrap();
+        let message = error(dir.path());
+        assert!(
+            message.contains("8 x 6") && message.contains("65535 x 65535"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn the_right_images_disparity_is_found_by_stem() {
+        let dir = dataset(&["a", "b"], &["a", "b"]);
+        let folder = dir.path().join("disparity_right");
+        std::fs::create_dir(&folder).unwrap();
+        let plane = Plane::from_pixel(8, 6, image::Luma([2.5]));
+        disparity_file::write_png(&folder.join("b.png"), &plane).unwrap();
+        let source = Folder::open(dir.path()).unwrap();
+        assert!(source.true_disparity_right(0).unwrap().is_none());
+        assert_eq!(source.true_disparity_right(1).unwrap(), Some(plane));
+        assert!(source.true_disparity(1).unwrap().is_none());
+    }
+
     /// What a camera at a pose sees of a wavy wall: the scene of the test below.
     fn photograph(rig: &Rig, camera: &Camera, T_cam_left: &Se3) -> image::GrayImage {
         image::GrayImage::from_fn(rig.width as u32, rig.height as u32, |u, v| {

@@ -80,7 +80,10 @@ fn read_scene(dir: &Path, name: String, time: f64) -> Result<Pair, DataError> {
         disparity_right,
     };
     let calib_file = dir.join("calib.txt");
-    if let Some((left, right)) = pair(["im0", "im1"]) {
+    // Scenes of 2003 have im0 to im8, but no calibration.
+    if let Some((left, right)) = pair(["im0", "im1"])
+        && calib_file.is_file()
+    {
         let size = image_size(&left)?;
         let rig = read_middlebury(&calib_file, Some((size.0 as usize, size.1 as usize)))?;
         let calibrated = Calibrated::new(&rig, &calib_file, &left)?;
@@ -244,9 +247,12 @@ mod tests {
         let size = (450, 375);
         save_image(&dir.path().join("im2.ppm"), size, 10);
         save_image(&dir.path().join("im6.ppm"), size, 20);
+        save_image(&dir.path().join("im0.ppm"), size, 30);
+        save_image(&dir.path().join("im1.ppm"), size, 40);
         grey(&dir.path().join("disp2.png"), size, 130);
         let source = open(dir.path()).unwrap();
         assert_eq!((source.rig().fx, source.rig().baseline), (935.0, 0.16));
+        assert_eq!(levels(&source, 0), (10, 20));
         assert_eq!(
             source.true_disparity(0).unwrap().unwrap()[(9, 9)].0[0],
             32.5

@@ -11,8 +11,8 @@ use crate::pairs::{Calibrated, Coding, Pair, PairSource, TrueDisparity};
 /// SceneFlow (Mayer et al. 2016): FlyingThings3D, Driving, Monkaa, their samples and the FlyingThings3D
 /// subset. A folder that holds `frames_cleanpass/` (or another of [`PASSES`], also with a name before
 /// it, as `driving_frames_cleanpass/`) and `disparity/` (or `driving_disparity/`) with the same folders
-/// inside, down to `left/` and `right/`. The clean pass is taken where both are there;
-/// a path to the pass itself chooses it.
+/// inside, down to `left/` and `right/`. The clean pass is taken where both are there; a path to a
+/// pass, or to a folder inside it (`frames_finalpass/TEST`), opens that.
 ///
 /// Names are those of the folders, joined: `TRAIN-A-0000-0006`. Disparity is PFM of either sign.
 /// The rig is Blender's: 35 mm on a sensor of 32 mm is 1050 px at 960x540 (450 px under
@@ -43,10 +43,12 @@ fn detect(dir: &Path) -> bool {
     passes(dir).is_ok_and(|passes| !passes.is_empty())
 }
 
-/// The folder of images is a pass; beside it its disparity, when there is some.
+/// A folder of images, and beside it its disparity, when there is some.
 struct Pass {
     images: PathBuf,
     disparity: Option<PathBuf>,
+    /// The part of it that is asked for.
+    inside: PathBuf,
 }
 
 fn as_pass(path: &Path) -> Option<(&'static str, Pass)> {
@@ -55,14 +57,25 @@ fn as_pass(path: &Path) -> Option<(&'static str, Pass)> {
     let prefix = name.strip_suffix(kind)?;
     let beside = |truth: &&str| path.join("..").join(format!("{prefix}{truth}"));
     let disparity = truths.iter().map(beside).find(|d| d.is_dir());
-    let images = path.to_owned();
-    Some((kind, Pass { images, disparity }))
+    let pass = Pass {
+        images: path.to_owned(),
+        disparity,
+        inside: PathBuf::new(),
+    };
+    Some((kind, pass))
 }
 
-/// The passes of a folder: itself, or of those within the ones of the preferred kind.
+/// The pass that a folder is or lies in; else, of those that it holds, the ones of the preferred kind.
 fn passes(dir: &Path) -> Result<Vec<Pass>, DataError> {
-    if let Some((_, pass)) = as_pass(dir) {
-        return Ok(vec![pass]);
+    let whole = dir.canonicalize().map_err(DataError::io(dir))?;
+    for above in whole.ancestors().take(MAX_DEPTH + 1) {
+        if let Some((_, pass)) = as_pass(above) {
+            let inside = whole
+                .strip_prefix(above)
+                .unwrap_or(Path::new(""))
+                .to_owned();
+            return Ok(vec![Pass { inside, ..pass }]);
+        }
     }
     let all: Vec<_> = folders(dir)?
         .iter()
@@ -85,9 +98,15 @@ fn open(dir: &Path) -> Result<PairSource, DataError> {
     }
     let mut rigs: Vec<(f64, Arc<Calibrated>)> = Vec::new();
     let mut pairs: Vec<Pair> = Vec::new();
-    for Pass { images, disparity } in passes {
+    for Pass {
+        images,
+        disparity,
+        inside,
+    } in passes
+    {
         let mut scenes = Vec::new();
-        find_scenes(&images, (String::new(), PathBuf::new()), 0, &mut scenes)?;
+        let parts = inside.iter().map(|part| part.to_string_lossy() + "-");
+        find_scenes(&images, (parts.collect(), inside), 0, &mut scenes)?;
         if scenes.is_empty() {
             return Err(DataError::file(
                 &images,
@@ -227,6 +246,13 @@ mod tests {
         let chosen = open(&at("frames_finalpass")).unwrap();
         assert_eq!((chosen.len(), levels(&chosen, 0)), (1, (30, 31)));
         assert!(chosen.true_disparity(0).unwrap().is_some());
+        for part in ["TRAIN", "TRAIN/A/0000"] {
+            let part = at("frames_cleanpass").join(part);
+            assert_eq!(detected(&part).first(), Some(&"sceneflow"));
+            let source = open(&part).unwrap();
+            assert_eq!(names(&source), ["TRAIN-A-0000-0006"]);
+            assert!(source.true_disparity(0).unwrap().is_some());
+        }
     }
 
     #[test]
