@@ -4,7 +4,7 @@ use barchan_geometry::{RectifiedRig, Trajectory};
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::folder::no_frame;
+use crate::pairs::no_frame;
 use crate::image_file::write_whole;
 use crate::resample::remap;
 use crate::{DataError, Plane, Rgb, Sensors, StereoFrame, StereoSource};

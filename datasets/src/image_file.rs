@@ -13,6 +13,19 @@ pub fn read_rgb(path: &Path) -> Result<Rgb, DataError> {
     decode(path).map(|image| image.into_rgb32f())
 }
 
+/// Width and height of an image, from its header.
+pub(crate) fn image_size(path: &Path) -> Result<(u32, u32), DataError> {
+    let reader = image::ImageReader::open(path)
+        .and_then(image::ImageReader::with_guessed_format)
+        .map_err(DataError::io(path))?;
+    reader.into_dimensions().map_err(|error| {
+        DataError::file(
+            path,
+            format!("truncated or corrupt ({error}); copy it again from its origin"),
+        )
+    })
+}
+
 /// Reads an image as its file holds it.
 pub(crate) fn decode(path: &Path) -> Result<DynamicImage, DataError> {
     let bytes = std::fs::read(path).map_err(DataError::io(path))?;
@@ -114,6 +127,37 @@ mod tests {
         }
         for (p, q) in a.as_raw().iter().zip(b.as_raw()) {
             assert!((p - q).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn sixteen_bits_of_grey_and_colour_are_read_from_every_format_that_has_them() {
+        let dir = tempfile::tempdir().unwrap();
+        for extension in ["png", "tif", "pgm", "ppm"] {
+            let path = dir.path().join(format!("deep.{extension}"));
+            let value = |x: u32, y: u32, c: u32| (x * 5003 + y * 977 + c * 211) as u16;
+            if extension != "ppm" {
+                let grey = ImageBuffer::from_fn(11, 6, |x, y| Luma([value(x, y, 0)]));
+                grey.save(&path).unwrap();
+                assert_eq!(image_size(&path).unwrap(), (11, 6));
+                for (x, y, p) in read_rgb(&path).unwrap().enumerate_pixels() {
+                    let expected = f32::from(value(x, y, 0)) / 65535.0;
+                    assert!(
+                        p.0.iter().all(|v| (v - expected).abs() < 1e-7),
+                        "{extension}"
+                    );
+                }
+            }
+            if extension != "pgm" {
+                let at = |x, y| Pixel([0, 1, 2].map(|c| value(x, y, c)));
+                ImageBuffer::from_fn(11, 6, at).save(&path).unwrap();
+                for (x, y, p) in read_rgb(&path).unwrap().enumerate_pixels() {
+                    for c in 0..3 {
+                        let expected = f32::from(value(x, y, c)) / 65535.0;
+                        assert!((p.0[c as usize] - expected).abs() < 1e-7, "{extension}");
+                    }
+                }
+            }
         }
     }
 

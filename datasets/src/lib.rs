@@ -1,36 +1,46 @@
 //! Stereo sequences from disk or rendered: one file per format.
 //!
 //! What it is for: a [`StereoSource`] yields rectified [`StereoFrame`]s and, when it has it, truth.
-//! [`open`] finds the format; [`prefetch`] reads ahead on threads; [`rows`] measures whether the
-//! rows of a pair correspond at all; [`disparity_file`] reads and writes disparity images;
+//! [`open`] finds the format ([`formats()`] lists them); [`load_rig`] reads the calibration of other
+//! tools; [`check`](mod@check) says whether the pairs are fit for stereo, and a [`Correction`] mends
+//! them; [`prefetch`] reads ahead on threads; [`disparity_file`] reads and writes disparity images;
 //! [`write_folder`] writes any source as images on disk.
 //!
 //! What it promises: frames are lazy (memory does not grow with the length of a sequence), images
 //! are `f32` in 0..=1, and an error names the file and the cure.
 //!
-//! What it never does: match features, run a network or judge a result.
+//! What it never does: run a network, or judge what one returns.
 
+mod calibration;
 pub mod check;
 mod correction;
 pub mod disparity_file;
 mod error;
-mod folder;
+mod formats;
 mod image_file;
+mod listing;
 mod open;
+mod pairs;
 mod prefetch;
 mod resample;
 mod sensors;
 mod source;
 pub mod synth;
+mod text;
 mod write_folder;
 
+pub use calibration::{CALIBRATIONS, load_rig, load_rig_of_size};
 pub use correction::{Corrected, Correction};
 pub use error::DataError;
-pub use folder::{Folder, read_planar};
+pub use formats::folder::Folder;
 pub use image_file::read_rgb;
-pub use open::{FORMATS, open};
+pub use open::{dataset_folder, formats, open, open_as_stored};
+pub use pairs::PairSource;
 pub use prefetch::{Prefetch, prefetch};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
 pub use synth::Synth;
+pub use text::read_planar;
 pub use write_folder::write_folder;
+
+use formats::folder;

@@ -1,47 +1,90 @@
 use std::path::Path;
 
-use crate::{DataError, Folder, StereoSource, Synth};
+use crate::formats::ON_DISK;
+use crate::{Corrected, Correction, DataError, StereoSource, Synth};
 
-/// What [`open`] understands, for help texts.
-pub const FORMATS: &[&str] = &["folder:PATH", "synth:seed=1,frames=60"];
+/// How to write a rendered traverse.
+const SYNTH: &str = "synth:seed=1,frames=60";
 
-/// Opens a dataset: `FORMAT:PATH`, or a plain path whose format is found out.
+/// What [`open`] understands, for help texts: how it is written, and what is looked for.
+pub fn formats() -> Vec<(String, &'static str)> {
+    let on_disk = ON_DISK
+        .iter()
+        .map(|f| (format!("{}:PATH", f.name), f.layout));
+    let synth = (SYNTH.to_owned(), "no files: a rendered traverse");
+    on_disk.chain([synth]).collect()
+}
+
+/// Opens a dataset: `FORMAT:PATH`, or a plain path whose format is found out. A [`Correction`] that
+/// lies in its folder is applied.
 ///
 /// # Errors
-/// When the format is unknown, the path is missing, or the dataset's layout is broken; the
-/// message says what was looked for.
+/// When the format is unknown, the path is missing, or the dataset's layout or its correction is
+/// broken; the message says what was looked for.
 pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
+    let source = open_as_stored(spec)?;
+    let correction = dataset_folder(spec).map(|folder| folder.join(Correction::FILE));
+    match correction.filter(|file| file.is_file()) {
+        Some(file) => Ok(Box::new(Corrected::new(source, Correction::load(&file)?)?)),
+        None => Ok(source),
+    }
+}
+
+/// The folder that a dataset lies in; `None` of a rendered one.
+pub fn dataset_folder(spec: &str) -> Option<&Path> {
+    if Path::new(spec).exists() {
+        return Some(Path::new(spec));
+    }
+    let (format, rest) = spec.split_once(':')?;
+    (format != "synth").then_some(Path::new(rest))
+}
+
+/// [`open`] without any correction.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_as_stored(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
     let path = Path::new(spec);
+    let known = || -> String {
+        let names: Vec<String> = formats().into_iter().map(|(name, _)| name).collect();
+        names.join(", ")
+    };
     if !path.exists()
-        && let Some((format, rest)) = spec
+        && let Some((name, rest)) = spec
             .split_once(':')
             .or((spec == "synth").then_some((spec, "")))
     {
-        return match format {
-            "folder" => Ok(Box::new(Folder::open(Path::new(rest))?)),
-            "synth" => Ok(Box::new(Synth::parse(rest)?)),
-            _ => Err(layout(
-                spec,
-                &format!("unknown format \"{format}\"; known: {}", FORMATS.join(", ")),
-            )),
+        if name == "synth" {
+            return Ok(Box::new(Synth::parse(rest)?));
+        }
+        let Some(format) = ON_DISK.iter().find(|f| f.name == name) else {
+            let message = format!("unknown format \"{name}\"; known: {}", known());
+            return Err(layout(spec, &message));
         };
+        if !Path::new(rest).is_dir() {
+            let message = format!("{rest}: no such folder; expected {}", format.layout);
+            return Err(layout(spec, &message));
+        }
+        return Ok(Box::new((format.open)(Path::new(rest))?));
     }
-    if !path.exists() {
-        return Err(layout(
-            spec,
-            &format!(
-                "no such folder. A dataset is a PATH or one of {}",
-                FORMATS.join(", ")
-            ),
-        ));
+    if !path.is_dir() {
+        let what = if path.exists() {
+            "a file, not a folder"
+        } else {
+            "no such folder"
+        };
+        let message = format!("{what}. A dataset is a PATH or one of {}", known());
+        return Err(layout(spec, &message));
     }
-    if Folder::detect(path) {
-        return Ok(Box::new(Folder::open(path)?));
+    if let Some(format) = ON_DISK.iter().find(|f| (f.detect)(path)) {
+        return Ok(Box::new((format.open)(path)?));
     }
-    Err(layout(
-        spec,
-        &format!("not a dataset: looked for {}", Folder::LAYOUT),
-    ))
+    let looked: Vec<String> = ON_DISK
+        .iter()
+        .map(|f| format!("\n  {}: {}", f.name, f.layout))
+        .collect();
+    let message = format!("not a dataset that is known; looked for{}", looked.concat());
+    Err(layout(spec, &message))
 }
 
 fn layout(spec: &str, message: &str) -> DataError {
@@ -65,7 +108,7 @@ mod tests {
         let spec = dir.path().to_str().unwrap();
         assert!(message(spec).contains("rig.toml"), "{}", message(spec));
         assert!(
-            message("katwjik:x").contains("known: folder:PATH"),
+            message("katwjik:x").contains("known: kitti-odometry:PATH"),
             "{}",
             message("katwjik:x")
         );

@@ -3,7 +3,7 @@ use std::path::Path;
 use nalgebra::{Matrix2x3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::camera::{Camera, CameraToml};
+use crate::camera::{Camera, CameraToml, Distortion};
 use crate::{GeometryError, Se3};
 
 /// Two cameras and their relative pose, as calibrated.
@@ -77,6 +77,8 @@ struct PoseToml {
     translation: [f64; 3],
 }
 
+const BASELINE: &str = "the distance between the cameras in metres, above zero";
+
 impl Rig {
     /// Reads `rig.toml`.
     ///
@@ -96,28 +98,8 @@ impl Rig {
             expected,
         };
         let camera = |field, c: &CameraToml| {
-            for value in [c.fx, c.fy] {
-                if !(value.is_finite() && value > 0.0) {
-                    return Err(bad(
-                        field,
-                        format!("focal length {value}"),
-                        "a positive number of pixels",
-                    ));
-                }
-            }
-            if !(c.cx.is_finite() && c.cy.is_finite() && c.distortion.iter().all(|k| k.is_finite()))
-            {
-                return Err(bad(field, "not finite".into(), "finite numbers"));
-            }
             Camera::from_toml(c).map_err(|value| bad(field, value, "a known camera model"))
         };
-        if toml.width == 0 || toml.height == 0 {
-            return Err(bad(
-                "width, height",
-                format!("{} x {}", toml.width, toml.height),
-                "an image size",
-            ));
-        }
         let left = camera("[left]", &toml.left)?;
         let right = toml
             .right
@@ -148,43 +130,81 @@ impl Rig {
             T_right_left: t_right_left,
             rectified: toml.rectified,
         };
-        let baseline = rig.baseline();
-        if !(baseline.is_finite() && baseline > 1e-6) || toml.baseline.is_some_and(|b| b <= 0.0) {
-            let value = toml.baseline.unwrap_or(baseline);
-            return Err(bad(
-                "baseline",
-                value.to_string(),
-                "the distance between the cameras in metres, above zero",
-            ));
+        if let Some(baseline) = toml.baseline.filter(|b| *b <= 0.0) {
+            return Err(bad("baseline", baseline.to_string(), BASELINE));
         }
-        let across = -rig.T_right_left.translation.x / baseline;
+        rig.validate(path)?;
+        Ok(rig)
+    }
+
+    /// Says no to values that no rig has, whatever file they were read from.
+    ///
+    /// # Errors
+    /// When the size is zero or beyond 65535, a number is not finite, a focal length or the
+    /// baseline is not positive, the right camera does not stand to the right of the left one, or
+    /// a rig called rectified is not; the message names `path` and the field.
+    pub fn validate(&self, path: &Path) -> Result<(), GeometryError> {
+        let bad = |field, value: String, expected| {
+            Err(GeometryError::RigValue {
+                path: path.to_owned(),
+                field,
+                value,
+                expected,
+            })
+        };
+        let size = 1..=usize::from(u16::MAX);
+        if !size.contains(&self.width) || !size.contains(&self.height) {
+            let value = format!("{} x {}", self.width, self.height);
+            return bad("width, height", value, "an image size");
+        }
+        for (field, camera) in [("[left]", &self.left), ("[right]", &self.right)] {
+            for value in [camera.fx, camera.fy] {
+                if !(value.is_finite() && value > 0.0) {
+                    let value = format!("focal length {value}");
+                    return bad(field, value, "a positive number of pixels");
+                }
+            }
+            let lens: &[f64] = match &camera.distortion {
+                Distortion::Pinhole => &[],
+                Distortion::RadTan(k) => k,
+                Distortion::Equidistant(k) => k,
+            };
+            if !([camera.cx, camera.cy].iter().chain(lens)).all(|v| v.is_finite()) {
+                return bad(field, "not finite".into(), "finite numbers");
+            }
+        }
+        let baseline = self.baseline();
+        if !(baseline.is_finite() && baseline > 1e-6) {
+            return bad("baseline", baseline.to_string(), BASELINE);
+        }
+        let across = -self.T_right_left.translation.x / baseline;
         if across < 0.7 {
-            let value = format!("{:?}", rig.T_right_left.translation.vector.as_slice());
-            return Err(bad(
+            let value = format!("{:?}", self.T_right_left.translation.vector.as_slice());
+            return bad(
                 "[right_from_left] translation",
                 value,
                 "mostly along -x: it maps left-camera points to a right camera that stands to the right",
-            ));
+            );
         }
-        if rig.rectified && (rig.T_right_left.rotation.angle() > 1e-6 || across < 1.0 - 1e-9) {
+        if self.rectified && (self.T_right_left.rotation.angle() > 1e-6 || across < 1.0 - 1e-9) {
             let value = format!(
                 "{:.3} degrees of rotation",
-                rig.T_right_left.rotation.angle().to_degrees()
+                self.T_right_left.rotation.angle().to_degrees()
             );
-            return Err(bad(
+            return bad(
                 "[right_from_left]",
                 value,
                 "a shift along x, as rectified = true",
-            ));
+            );
         }
-        if rig.rectified && rig.left.fy != rig.right.fy {
-            return Err(bad(
+        if self.rectified && self.left.fy != self.right.fy {
+            return bad(
                 "[right] fy",
-                rig.right.fy.to_string(),
+                self.right.fy.to_string(),
                 "that of [left], as rectified = true",
-            ));
+            );
         }
-        Ok(rig)
+        Ok(())
     }
 
     /// Distance between the optical centres, metres.
@@ -342,7 +362,6 @@ impl RectifiedRig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Distortion;
 
     fn rectified() -> RectifiedRig {
         RectifiedRig {

@@ -123,7 +123,8 @@ const FRAMES: usize = 12;
 const PATCHES: usize = 720;
 /// Slips looked for, frames either way.
 const LAGS: isize = 6;
-/// Rows that are off by less than this at the borders of the image harm nothing, pixels.
+/// Rows that are off by less than this harm nothing, pixels; taken where one match in ten is worse, so
+/// that corners where nothing was found do not count.
 const HARMLESS: f64 = 0.5;
 
 /// Looks at up to 12 frames spread over the sequence, and at 3 stretches of 13 when the rows do not
@@ -265,6 +266,7 @@ fn find_slip(source: &dyn StereoSource) -> Result<Pairing, DataError> {
     let len = source.len() as isize;
     let middles = spread(source.len(), 4).into_iter().skip(1);
     let mut by_lag: Vec<Vec<RowMatch>> = vec![Vec::new(); 2 * LAGS as usize + 1];
+    let mut stretches = vec![0usize; by_lag.len()];
     for middle in middles {
         let middle = middle as isize;
         let around: Vec<isize> = (-LAGS..=LAGS)
@@ -287,18 +289,24 @@ fn find_slip(source: &dyn StereoSource) -> Result<Pairing, DataError> {
             .collect::<Result<_, DataError>>()?;
         for (lag, matches) in found {
             by_lag[(lag + LAGS) as usize].extend(matches);
+            stretches[(lag + LAGS) as usize] += 1;
         }
     }
-    let explained: Vec<usize> = by_lag
+    // A stretch near an end of the sequence does not reach every lag.
+    let explained: Vec<f64> = by_lag
         .iter()
-        .map(|matches| RowModel::fit(matches).map_or(0, |rows| rows.explained))
+        .zip(&stretches)
+        .map(|(matches, stretches)| {
+            let explained = RowModel::fit(matches).map_or(0, |rows| rows.explained);
+            explained as f64 / (*stretches).max(1) as f64
+        })
         .collect();
     let now = explained[LAGS as usize];
     let best = (0..explained.len())
-        .max_by_key(|k| explained[*k])
+        .max_by(|a, b| explained[*a].total_cmp(&explained[*b]))
         .unwrap_or(LAGS as usize);
     // A rover that hardly moves agrees at every lag: then the images as they are come first.
-    let better = explained[best] as f64 > 1.25 * now as f64 + 10.0;
+    let better = explained[best] > 1.25 * now + 5.0;
     Ok(Pairing {
         lag: if better { best as isize - LAGS } else { 0 },
     })
@@ -410,12 +418,13 @@ fn judge_rows(
         return false;
     };
     let before = findings.len();
-    let mut say = |fault, value: f64, at_border: f64, text: String| {
-        if at_border.abs() > HARMLESS {
+    let mut say = |fault, value: f64, pixels: f64, text: String| {
+        if pixels.abs() > HARMLESS {
             findings.push(Finding { fault, value, text });
         }
     };
     let half = Vector2::new(rig.width as f64, rig.height as f64) / 2.0;
+    let [keystone, tilt, growth] = rows.reach;
     let of = format!("over {} matches, spread {:.2} px", rows.matches, rows.spread);
     let lower = |v: f64| if v > 0.0 { "lower" } else { "higher" };
     say(
@@ -444,7 +453,7 @@ fn judge_rows(
     say(
         Fault::Yaw,
         rows.yaw.to_degrees(),
-        corner,
+        rows.yaw * rig.fy * keystone,
         format!(
             "the right camera is yawed by {:.2} degrees: rows are {:.2} px off in the corners ({of})",
             rows.yaw.to_degrees().abs(),
@@ -455,7 +464,7 @@ fn judge_rows(
     say(
         Fault::Roll,
         rows.roll.to_degrees(),
-        side,
+        rows.roll * rig.fy * tilt,
         format!(
             "the right camera is rolled by {:.2} degrees: the right side of its images lies {:.2} px {}, the left side as much the other way ({of})",
             rows.roll.to_degrees().abs(),
@@ -467,7 +476,7 @@ fn judge_rows(
     say(
         Fault::Scale,
         100.0 * rows.scale,
-        edge,
+        rows.scale * rig.fy * growth,
         format!(
             "the right images are {:.2} % {}: rows are {:.2} px off at top and bottom ({of})",
             100.0 * rows.scale.abs(),

@@ -5,7 +5,7 @@ use crate::{Plane, Rgb, luma};
 
 /// What the images of a pair say without being matched.
 pub(super) struct Photometry {
-    /// Share of over-exposed pixels, left and right together.
+    /// Share of over-exposed pixels in the lower halves of both images: a white sky costs nothing.
     saturated: f64,
     sharpness: [f64; 2],
 }
@@ -13,11 +13,13 @@ pub(super) struct Photometry {
 impl Photometry {
     pub fn new(left: &Rgb, right: &Rgb) -> Self {
         let saturated = |image: &Rgb| {
-            let white = image
-                .pixels()
-                .filter(|p| p.0.iter().all(|v| *v >= 254.0 / 255.0))
+            let values = image.as_raw();
+            let lower = &values[values.len() / 6 * 3..];
+            let white = lower
+                .chunks_exact(3)
+                .filter(|p| p.iter().all(|v| *v >= 254.0 / 255.0))
                 .count();
-            white as f64 / (image.width() * image.height()).max(1) as f64
+            white as f64 / (lower.len() / 3).max(1) as f64
         };
         Self {
             saturated: (saturated(left) + saturated(right)) / 2.0,
@@ -67,7 +69,7 @@ pub(super) fn judge(pairs: &[&Photometry], findings: &mut Vec<Finding>) {
             fault: Fault::Saturation,
             value: white,
             text: format!(
-                "{:.0} % of the pixels are white: nothing can be matched there; expose less",
+                "{:.0} % of the lower half of the images is white: nothing can be matched there; expose less",
                 100.0 * white
             ),
         });

@@ -59,6 +59,7 @@ pub(super) fn pose_scale(
     }
     let (baseline, by_baseline) = fit_factor(&tracks, |t, factor| scaled(t, factor, 1.0));
     let (focal_length, by_focal) = fit_factor(&tracks, |t, factor| scaled(t, 1.0, factor));
+    if std::env::var("DBG").is_ok() { eprintln!("base {baseline} {:?} focal {focal_length} {:?}", median(&mut by_baseline.clone()), median(&mut by_focal.clone())); for l in looks { let ts: Vec<Track> = self::tracks(source,l,truth,rows).unwrap(); if ts.len()>5 { let (b,r)=fit_factor(&ts,|t,f|scaled(t,f,1.0)); eprintln!("{} n {} base {b:.3} med {:.2} move {:?}", l.frame, ts.len(), median(&mut r.clone()), ts[0].T_second_first.translation.vector.norm()); } } }
     let spread_of = |residuals: &[f64]| median(&mut residuals.to_vec());
     let sigma = spread_of(&by_baseline).min(spread_of(&by_focal)).max(0.1);
     let cost = |residuals: &[f64]| {

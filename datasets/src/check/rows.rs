@@ -27,6 +27,10 @@ pub struct RowModel {
     pub matches: usize,
     /// See `matches`.
     pub explained: usize,
+    /// How far out the matches lie, so that nine in ten lie nearer: the product of column and row,
+    /// column, and row, from the principal point in units of the focal length.
+    #[serde(skip)]
+    pub(super) reach: [f64; 3],
 }
 
 /// A match of the left and the right image, and the rig it was seen with.
@@ -35,6 +39,17 @@ pub(super) struct RowMatch {
     pub rig: RectifiedRig,
     pub left: Vector2<f64>,
     pub right: Vector2<f64>,
+}
+
+impl RowMatch {
+    /// The place in the right image, from the principal point in units of the focal length.
+    fn ray(&self) -> Vector2<f64> {
+        let rig = &self.rig;
+        Vector2::new(
+            (self.right.x - rig.cx - rig.doffs) / rig.fx,
+            (self.right.y - rig.cy) / rig.fy,
+        )
+    }
 }
 
 /// Fewer matches say nothing.
@@ -74,6 +89,12 @@ impl RowModel {
             matches: matches.len(),
             ..Self::default()
         };
+        let reach = |of: &dyn Fn(Vector2<f64>) -> f64| {
+            let mut sizes: Vec<f64> = matches.iter().map(|m| of(m.ray()).abs()).collect();
+            sizes.sort_by(f64::total_cmp);
+            sizes[(sizes.len() - 1) * 9 / 10]
+        };
+        model.reach = [reach(&|r| r.x * r.y), reach(&|r| r.x), reach(&|r| r.y)];
         let residuals = residuals(matches, &best);
         let tolerance = |m: &RowMatch| 0.75 * (m.rig.width as f64 / 640.0).max(1.0);
         model.spread = deviation(&residuals);
@@ -172,10 +193,8 @@ fn fit_causes(
         let mut right_side = Parameters::zeros();
         for (m, r) in matches.iter().zip(&residuals) {
             let weight = biweight(r / scale).0;
-            let (x, y) = (
-                (m.right.x - m.rig.cx - m.rig.doffs) / m.rig.fx,
-                (m.right.y - m.rig.cy) / m.rig.fy,
-            );
+            let ray = m.ray();
+            let (x, y) = (ray.x, ray.y);
             // To first order of small angles; the loop makes up for the rest.
             let f = m.rig.fy;
             let row = Parameters::from([-1.0, f * (1.0 + y * y), -f * x * y, -f * x, -f * y]);

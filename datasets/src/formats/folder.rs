@@ -1,310 +1,104 @@
-use std::cmp::Ordering;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use barchan_geometry::{Rectification, RectifiedRig, Rig, Se3, StampedPose, Trajectory};
+use barchan_geometry::{StampedPose, Trajectory};
 
-use crate::resample::remap;
-use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource, disparity_file, read_rgb};
+use super::Format;
+use crate::DataError;
+use crate::calibration::{find_calibration, load_rig_of_size};
+use crate::image_file::image_size;
+use crate::listing::{DISPARITIES, IMAGES, list, pair_up};
+pub(crate) use crate::pairs::no_frame;
+use crate::pairs::{Calibrated, Coding, Pair, PairSource, TrueDisparity};
+use crate::text::{read_planar, read_times};
 
 /// Format `folder`: the user's own images.
 ///
 /// `left/` and `right/` hold images of the same stems, or of other names in the same order;
-/// `rig.toml` the calibration. When present: `times.txt` (seconds, one a line); truth in
-/// `poses.txt` (KITTI rows), `groundtruth.tum` or `gt.csv` (`time,x,y[,...]`, planar);
-/// `disparity/` (16-bit PNG or PFM by the stems of `left/`, of the rectified left image).
+/// `rig.toml` the calibration, or a file of another tool that [`crate::load_rig`] reads: `calib.txt`,
+/// `left.yaml` and `right.yaml`, `stereo.yml`, `intrinsics.yml` and `extrinsics.yml` and others
+/// (`rig.toml` wins; without any, the error lists the names). When present: `times.txt`
+/// (seconds, one a line); truth in `poses.txt` (KITTI rows), `groundtruth.tum` or `gt.csv`
+/// (`time,x,y[,...]`, planar); `disparity/` (16-bit PNG or PFM by the stems of `left/`, of the
+/// rectified left image) and `disparity_right/` (the same of the right image).
 ///
 /// Images of an unrectified rig are rectified on reading, and truth moves with the left camera.
-pub struct Folder {
-    rig: RectifiedRig,
-    /// Size of the images on disk.
-    stored: (u32, u32),
-    /// For a rig that is not rectified.
-    rectification: Option<Rectification>,
-    pairs: Vec<Pair>,
-    times: Vec<f64>,
-    truth: Option<Trajectory>,
-}
+pub struct Folder;
 
-struct Pair {
-    name: String,
-    left: PathBuf,
-    right: PathBuf,
-    disparity: Option<PathBuf>,
-}
-
-const IMAGES: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "ppm", "pgm", "pnm"];
-const DISPARITIES: &[&str] = &["png", "pfm"];
+pub(super) const FORMAT: Format = Format {
+    name: "folder",
+    layout: Folder::LAYOUT,
+    detect: Folder::detect,
+    open: Folder::open,
+};
 
 impl Folder {
     /// What [`Folder::detect`] looks for, in words.
-    pub const LAYOUT: &str = "left/, right/ and rig.toml (format folder)";
+    pub const LAYOUT: &str =
+        "left/, right/ and rig.toml (or another tool's calibration: calib.txt, stereo.yml, ...)";
 
-    /// Whether a folder has the layout.
+    /// Whether a folder has the layout. (That the calibration is missing is for
+    /// [`Folder::open`] to say.)
     pub fn detect(dir: &Path) -> bool {
-        dir.join("left").is_dir() && dir.join("right").is_dir() && dir.join("rig.toml").is_file()
+        dir.join("left").is_dir() && dir.join("right").is_dir()
     }
 
     /// Lists the images and reads everything else. The images themselves are read by frame.
     ///
     /// # Errors
-    /// When a folder or `rig.toml` is missing, a folder is empty, an image has no partner, or
+    /// When a folder or the calibration is missing, a folder is empty, an image has no partner, or
     /// times or poses do not match the images in number.
-    pub fn open(dir: &Path) -> Result<Self, DataError> {
+    pub fn open(dir: &Path) -> Result<PairSource, DataError> {
         if !dir.is_dir() {
             return Err(DataError::file(
                 dir,
                 format!("no such folder; expected {}", Self::LAYOUT),
             ));
         }
-        let rig_file = dir.join("rig.toml");
-        if !rig_file.is_file() {
-            return Err(DataError::file(
-                &rig_file,
-                "missing: the calibration is needed; the README lists its fields",
-            ));
-        }
-        let rig = Rig::load(&rig_file)?;
-        let (rectified, rectification) = match rig.as_rectified() {
-            Some(rectified) => (rectified, None),
-            None => {
-                let rectification = Rectification::new(&rig);
-                (rectification.rig, Some(rectification))
-            }
-        };
-        let mut pairs = pair_up(
+        let calibration = find_calibration(dir)?;
+        let images = pair_up(
             list(&dir.join("left"), IMAGES)?,
             list(&dir.join("right"), IMAGES)?,
         )?;
-        if dir.join("disparity").is_dir() {
-            let disparities: BTreeMap<String, PathBuf> = list(&dir.join("disparity"), DISPARITIES)?
-                .into_iter()
-                .collect();
-            for pair in &mut pairs {
-                pair.disparity = disparities.get(&pair.name).cloned();
+        // Both lists hold something, so there is a first pair. Its header tells the size where the
+        // calibration does not.
+        let [(_, first, _), ..] = images.as_slice() else {
+            return Err(DataError::file(dir, "holds no image pair"));
+        };
+        let size = image_size(first)
+            .ok()
+            .map(|(w, h)| (w as usize, h as usize));
+        let rig = load_rig_of_size(&calibration, size)?;
+        let calibrated = Calibrated::new(&rig, &calibration[0], first)?;
+        let disparities = |name: &str| -> Result<BTreeMap<String, PathBuf>, DataError> {
+            let dir = dir.join(name);
+            if !dir.is_dir() {
+                return Ok(BTreeMap::new());
             }
+            Ok(list(&dir, DISPARITIES)?.into_iter().collect())
+        };
+        let truth_of = |files: &BTreeMap<String, PathBuf>, name: &String| {
+            let path = files.get(name)?.clone();
+            let coding = Coding::Plain;
+            Some(TrueDisparity { path, coding })
+        };
+        let (of_left, of_right) = (disparities("disparity")?, disparities("disparity_right")?);
+        let (times, mut truth) = times_and_truth(dir, images.len())?;
+        for pose in truth.iter_mut().flat_map(|truth| &mut truth.poses) {
+            pose.T_world_cam *= calibrated.R_rect_left().inverse();
         }
-        let (times, mut truth) = times_and_truth(dir, pairs.len())?;
-        if let (Some(truth), Some(rectification)) = (&mut truth, &rectification) {
-            for pose in &mut truth.poses {
-                pose.T_world_cam *= rectification.R_rect_left.inverse();
-            }
-        }
-        let stored = (rig.width as u32, rig.height as u32);
-        Ok(Self {
-            rig: rectified,
-            stored,
-            rectification,
-            pairs,
-            times,
-            truth,
-        })
-    }
-
-    fn read(&self, path: &Path) -> Result<Rgb, DataError> {
-        let image = read_rgb(path)?;
-        same_size(path, image.dimensions(), self.stored)?;
-        Ok(image)
-    }
-}
-
-impl StereoSource for Folder {
-    fn rig(&self) -> &RectifiedRig {
-        &self.rig
-    }
-
-    fn len(&self) -> usize {
-        self.pairs.len()
-    }
-
-    fn name(&self, index: usize) -> String {
-        self.pairs
-            .get(index)
-            .map_or_else(String::new, |pair| pair.name.clone())
-    }
-
-    fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
-        let pair = self
-            .pairs
-            .get(index)
-            .ok_or_else(|| no_frame(index, self.pairs.len()))?;
-        let (mut left, mut right) = (self.read(&pair.left)?, self.read(&pair.right)?);
-        if let Some(maps) = &self.rectification {
-            left = remap(&left, &maps.left_map);
-            right = remap(&right, &maps.right_map);
-        }
-        Ok(StereoFrame {
-            index,
-            name: pair.name.clone(),
-            time: self.times[index],
+        let pair = |((name, left, right), time)| Pair {
+            disparity: truth_of(&of_left, &name),
+            disparity_right: truth_of(&of_right, &name),
+            name,
+            time,
             left,
             right,
-        })
-    }
-
-    fn true_disparity(&self, index: usize) -> Result<Option<Plane>, DataError> {
-        let Some(path) = self
-            .pairs
-            .get(index)
-            .and_then(|pair| pair.disparity.as_ref())
-        else {
-            return Ok(None);
+            calibrated: calibrated.clone(),
         };
-        let plane = disparity_file::read(path)?;
-        same_size(
-            path,
-            plane.dimensions(),
-            (self.rig.width as u32, self.rig.height as u32),
-        )?;
-        Ok(Some(plane))
+        let pairs = images.into_iter().zip(times).map(pair).collect();
+        Ok(PairSource::new(dir, pairs)?.with_truth(truth))
     }
-
-    fn true_trajectory(&self) -> Option<&Trajectory> {
-        self.truth.as_ref()
-    }
-}
-
-/// Nobody should ask for a frame beyond the end, but asking must not panic.
-pub(crate) fn no_frame(index: usize, len: usize) -> DataError {
-    DataError::Layout {
-        spec: format!("frame {index}"),
-        message: format!("there are {len} frames, counted from 0"),
-    }
-}
-
-fn same_size(path: &Path, found: (u32, u32), rig: (u32, u32)) -> Result<(), DataError> {
-    if found == rig {
-        return Ok(());
-    }
-    let message = format!(
-        "the image is {} x {}, but rig.toml says {} x {}: every image of both sides has the size of the calibration",
-        found.0, found.1, rig.0, rig.1
-    );
-    Err(DataError::file(path, message))
-}
-
-/// Stem and path of every file of the given extensions, in natural order of the stems.
-fn list(dir: &Path, extensions: &[&str]) -> Result<Vec<(String, PathBuf)>, DataError> {
-    if !dir.is_dir() {
-        return Err(DataError::file(
-            dir,
-            format!("no such folder; expected {}", Folder::LAYOUT),
-        ));
-    }
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(dir).map_err(DataError::io(dir))? {
-        let path = entry.map_err(DataError::io(dir))?.path();
-        let known = path
-            .extension()
-            .and_then(|e| e.to_str())
-            .is_some_and(|e| extensions.contains(&e.to_ascii_lowercase().as_str()));
-        let stem = path
-            .file_stem()
-            .map(|s| s.to_string_lossy().into_owned())
-            .unwrap_or_default();
-        if known && !stem.starts_with('.') && path.is_file() {
-            files.push((stem, path));
-        }
-    }
-    if files.is_empty() {
-        return Err(DataError::file(
-            dir,
-            format!("holds no image ({})", extensions.join(", ")),
-        ));
-    }
-    files.sort_by(|a, b| natural(&a.0, &b.0));
-    if let Some(twice) = files.windows(2).find(|w| w[0].0 == w[1].0) {
-        let message = format!(
-            "and {} have the same stem: remove one",
-            twice[1].1.display()
-        );
-        return Err(DataError::file(&twice[0].1, message));
-    }
-    Ok(files)
-}
-
-/// Orders names as people do: `img2` before `img10`.
-fn natural(a: &str, b: &str) -> Ordering {
-    let (mut rest_a, mut rest_b) = (a, b);
-    loop {
-        let (run_a, run_b) = (digits(rest_a), digits(rest_b));
-        let order = if !run_a.is_empty() && !run_b.is_empty() {
-            let (value_a, value_b) = (run_a.trim_start_matches('0'), run_b.trim_start_matches('0'));
-            let order = value_a.len().cmp(&value_b.len()).then(value_a.cmp(value_b));
-            (rest_a, rest_b) = (&rest_a[run_a.len()..], &rest_b[run_b.len()..]);
-            order
-        } else {
-            let (mut chars_a, mut chars_b) = (rest_a.chars(), rest_b.chars());
-            let (c, d) = (chars_a.next(), chars_b.next());
-            if c.is_none() && d.is_none() {
-                // 01 and 1: equal as numbers, ordered as text.
-                return a.cmp(b);
-            }
-            (rest_a, rest_b) = (chars_a.as_str(), chars_b.as_str());
-            c.cmp(&d)
-        };
-        if order != Ordering::Equal {
-            return order;
-        }
-    }
-}
-
-/// The digits a text starts with.
-fn digits(text: &str) -> &str {
-    &text[..text
-        .find(|c: char| !c.is_ascii_digit())
-        .unwrap_or(text.len())]
-}
-
-/// Pairs by stem when any stem occurs on both sides, else by order.
-fn pair_up(
-    left: Vec<(String, PathBuf)>,
-    right: Vec<(String, PathBuf)>,
-) -> Result<Vec<Pair>, DataError> {
-    let pair = |(name, left): (String, PathBuf), right: PathBuf| Pair {
-        name,
-        left,
-        right,
-        disparity: None,
-    };
-    let left_stems: BTreeSet<&String> = left.iter().map(|(stem, _)| stem).collect();
-    if right.iter().any(|(stem, _)| left_stems.contains(stem)) {
-        if let Some((stem, lonely)) = right.iter().find(|(stem, _)| !left_stems.contains(stem)) {
-            return Err(no_partner("left", stem, lonely));
-        }
-        let mut by_stem: BTreeMap<String, PathBuf> = right.into_iter().collect();
-        let partner = |(stem, path): (String, PathBuf)| match by_stem.remove(&stem) {
-            Some(right) => Ok(pair((stem, path), right)),
-            None => Err(no_partner("right", &stem, &path)),
-        };
-        return left.into_iter().map(partner).collect();
-    }
-    if left.len() != right.len() {
-        let dir = right[0].1.parent().unwrap_or(&right[0].1);
-        let message = format!(
-            "{} images here and {} in left/, and no names in common: give both sides the same names, or the same number",
-            right.len(),
-            left.len()
-        );
-        return Err(DataError::file(dir, message));
-    }
-    Ok(left
-        .into_iter()
-        .zip(right)
-        .map(|(left, (_, right))| pair(left, right))
-        .collect())
-}
-
-fn no_partner(missing_side: &str, stem: &str, lonely: &Path) -> DataError {
-    let name = lonely.file_name().unwrap_or_default();
-    // The image lies in left/ or right/, so it has a grandparent.
-    let root = lonely.parent().and_then(Path::parent).unwrap_or(lonely);
-    let missing = root.join(missing_side).join(name);
-    let message = format!(
-        "missing: {} is there, so {missing_side}/ needs an image named {stem}",
-        lonely.display()
-    );
-    DataError::file(&missing, message)
 }
 
 /// Times from `times.txt`, else `gt.csv`, else the index; and truth when there is any.
@@ -394,74 +188,13 @@ fn match_by_time(
     })
 }
 
-fn read_times(path: &Path) -> Result<Vec<f64>, DataError> {
-    let text = std::fs::read_to_string(path).map_err(DataError::io(path))?;
-    let lines = text
-        .lines()
-        .enumerate()
-        .filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
-    lines.map(|(i, line)| number(path, i, line)).collect()
-}
-
-/// Planar truth (`gt.csv`): a header, then `time,x,y[,...]` in the order that the header gives. Poses
-/// stand with z = 0 and no rotation.
-///
-/// # Errors
-/// When the file cannot be read, a column is missing, or a cell is no number.
-pub fn read_planar(path: &Path) -> Result<Trajectory, DataError> {
-    let text = std::fs::read_to_string(path).map_err(DataError::io(path))?;
-    let mut lines = text
-        .lines()
-        .enumerate()
-        .filter(|(_, line)| !line.trim().is_empty());
-    let header: Vec<&str> = lines
-        .next()
-        .map(|(_, l)| l.split(',').map(str::trim).collect())
-        .unwrap_or_default();
-    let column = |name: &str| {
-        let message = || format!("the header has no column \"{name}\"; expected time,x,y");
-        header
-            .iter()
-            .position(|h| *h == name)
-            .ok_or_else(|| DataError::file(path, message()))
-    };
-    let columns = [column("time")?, column("x")?, column("y")?];
-    let mut poses = Vec::new();
-    for (i, line) in lines {
-        let cells: Vec<&str> = line.split(',').collect();
-        let mut row = [0.0; 3];
-        for (value, column) in row.iter_mut().zip(columns) {
-            *value = number(path, i, cells.get(column).unwrap_or(&"nothing"))?;
-        }
-        poses.push(StampedPose {
-            time: row[0],
-            T_world_cam: Se3::translation(row[1], row[2], 0.0),
-        });
-    }
-    Ok(Trajectory { poses })
-}
-
-fn number(path: &Path, line: usize, text: &str) -> Result<f64, DataError> {
-    let message = || {
-        format!(
-            "line {}: expected a number, found \"{}\"",
-            line + 1,
-            text.trim()
-        )
-    };
-    text.trim()
-        .parse()
-        .ok()
-        .filter(|v: &f64| v.is_finite())
-        .ok_or_else(|| DataError::file(path, message()))
-}
-
 #[cfg(test)]
 #[allow(non_snake_case)]
 mod tests {
     use super::*;
+    use crate::{Plane, StereoSource, disparity_file};
     use barchan_geometry::nalgebra::{Point3, Vector3};
-    use barchan_geometry::{Camera, Distortion, se3};
+    use barchan_geometry::{Camera, Distortion, Rig, Se3, se3};
 
     const RIG: &str = "rectified = true\nwidth = 8\nheight = 6\nbaseline = 0.1\n[left]\nfx = 9.0\nfy = 9.0\ncx = 4.0\ncy = 3.0\n";
 
@@ -489,7 +222,7 @@ mod tests {
     }
 
     /// The grey level of the right image of each frame: which file it came from.
-    fn rights(folder: &Folder) -> Vec<u8> {
+    fn rights(folder: &PairSource) -> Vec<u8> {
         let level = |i| (folder.frame(i).unwrap().right[(0, 0)].0[0] * 255.0).round() as u8;
         (0..folder.len()).map(level).collect()
     }
@@ -578,7 +311,7 @@ mod tests {
 
         write("gt.csv", "time,x,y,dx\n5.0,1,2,0\n6.5,3,4,0\n");
         let folder = Folder::open(dir.path()).unwrap();
-        let pose = |folder: &Folder, i: usize| folder.true_trajectory().unwrap().poses[i];
+        let pose = |folder: &PairSource, i: usize| folder.true_trajectory().unwrap().poses[i];
         assert_eq!(folder.frame(1).unwrap().time, 6.5);
         assert_eq!(
             pose(&folder, 1),
@@ -665,6 +398,57 @@ mod tests {
                 .to_string()
                 .contains("4 x 4")
         );
+    }
+
+    #[test]
+    fn another_tools_calibration_stands_in_for_rig_toml_with_the_size_of_the_images() {
+        let dir = dataset(&["a"], &["a"]);
+        let p = |shift: f64| format!("9 0 4 {shift} 0 9 3 0 0 0 1 0");
+        let kitti = format!("P0: {}\nP1: {}\n", p(0.0), p(-1.8));
+        std::fs::write(dir.path().join("calib.txt"), kitti).unwrap();
+        assert_eq!(Folder::open(dir.path()).unwrap().rig().baseline, 0.1);
+        std::fs::remove_file(dir.path().join("rig.toml")).unwrap();
+        let rig = *Folder::open(dir.path()).unwrap().rig();
+        assert!((rig.baseline - 0.2).abs() < 1e-12);
+        assert_eq!((rig.width, rig.height, rig.fx, rig.cx), (8, 6, 9.0, 4.0));
+        std::fs::remove_file(dir.path().join("calib.txt")).unwrap();
+        let message = error(dir.path());
+        for name in [
+            "rig.toml",
+            "calib.txt",
+            "left.yaml + right.yaml",
+            "stereo.xml",
+        ] {
+            assert!(message.contains(name), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_calibration_of_another_size_is_refused_before_its_maps_are_made() {
+        let dir = dataset(&["a"], &["a"]);
+        let text = RIG
+            .replace("rectified = true", "rectified = false")
+            .replace("width = 8", "width = 65535")
+            .replace("height = 6", "height = 65535");
+        std::fs::write(dir.path().join("rig.toml"), text).unwrap();
+        let message = error(dir.path());
+        assert!(
+            message.contains("8 x 6") && message.contains("65535 x 65535"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn the_right_images_disparity_is_found_by_stem() {
+        let dir = dataset(&["a", "b"], &["a", "b"]);
+        let folder = dir.path().join("disparity_right");
+        std::fs::create_dir(&folder).unwrap();
+        let plane = Plane::from_pixel(8, 6, image::Luma([2.5]));
+        disparity_file::write_png(&folder.join("b.png"), &plane).unwrap();
+        let source = Folder::open(dir.path()).unwrap();
+        assert!(source.true_disparity_right(0).unwrap().is_none());
+        assert_eq!(source.true_disparity_right(1).unwrap(), Some(plane));
+        assert!(source.true_disparity(1).unwrap().is_none());
     }
 
     /// What a camera at a pose sees of a wavy wall: the scene of the test below.
