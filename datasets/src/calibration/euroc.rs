@@ -85,7 +85,7 @@ pub(crate) mod tests {
         )
     }
 
-    fn pair(rig: &Rig) -> [(&'static str, String); 2] {
+    pub(in super::super) fn pair(rig: &Rig) -> [(&'static str, String); 2] {
         let T_body_left = Se3::new(
             Vector3::new(-0.02, -0.06, 0.01),
             Vector3::new(0.0, 0.1, 1.5),

@@ -85,10 +85,10 @@ pub(super) fn parse(
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::tests::{assert_same, load, message, straight};
 
-    fn text() -> String {
+    pub(in super::super) fn text() -> String {
         "cam0=[718.5 0 360.25; 0 718.5 241.75; 0 0 1]\r\ncam1=[718.5 0 391.75; 0 718.5 241.75; 0 0 1]\r\ndoffs=31.5\r\nbaseline=193\r\nwidth=740\r\nheight=500\r\nndisp=70".into()
     }
 

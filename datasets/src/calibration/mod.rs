@@ -163,6 +163,8 @@ pub(crate) mod tests {
     use super::*;
     use barchan_geometry::nalgebra::Vector3;
     use barchan_geometry::{Camera, Distortion, RectifiedRig, Se3, se3};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
     /// A rig with both lenses bent and both cameras turned.
     pub(crate) fn crooked() -> Rig {
@@ -305,5 +307,53 @@ pub(crate) mod tests {
             let found = find_calibration(dir.path()).unwrap();
             assert!(found.last().unwrap().ends_with(name));
         }
+    }
+
+    /// Files cut short, with bytes changed, and with numbers made huge: an error or a possible rig,
+    /// never a panic.
+    #[test]
+    fn damaged_files_never_panic() {
+        let [yaml, xml] = opencv::tests::samples();
+        let kitti = "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP1: 700 0 600 -380 0 700 180 0 0 0 1 0\n";
+        let single = [yaml, xml, middlebury::tests::text(), kitti.to_owned()];
+        let mut samples: Vec<Vec<String>> = single.into_iter().map(|s| vec![s]).collect();
+        samples.push(ros::tests::pair(&crooked()).map(|(_, text)| text).to_vec());
+        samples.push(
+            euroc::tests::pair(&crooked())
+                .map(|(_, text)| text)
+                .to_vec(),
+        );
+
+        let dir = tempfile::tempdir().unwrap();
+        let names = [dir.path().join("left.yaml"), dir.path().join("right.yaml")];
+        let mut random = ChaCha8Rng::seed_from_u64(7);
+        let (mut read, mut refused) = (0, 0);
+        for files in &samples {
+            let paths = &names[..files.len()];
+            for _ in 0..300 {
+                for (path, text) in paths.iter().zip(files) {
+                    let mut bytes = text.clone().into_bytes();
+                    let at = random.random_range(0..bytes.len());
+                    match random.random_range(0..4) {
+                        0 => bytes.truncate(at),
+                        1 => bytes[at] = b" -:[]{}<>&*!%#e9\n\0\xff"[random.random_range(0..19)],
+                        2 => drop(bytes.splice(at..at, *b"9999999999e99")),
+                        _ => drop(bytes.drain(at..(at + 20).min(text.len()))),
+                    }
+                    std::fs::write(path, bytes).unwrap();
+                }
+                match load_rig_of_size(paths, Some((640, 480))) {
+                    Ok(rig) => {
+                        rig.validate(&paths[0]).unwrap();
+                        read += 1;
+                    }
+                    Err(error) => {
+                        assert!(error.to_string().contains(dir.path().to_str().unwrap()));
+                        refused += 1;
+                    }
+                }
+            }
+        }
+        assert!(read > 50 && refused > 500, "{read} {refused}");
     }
 }

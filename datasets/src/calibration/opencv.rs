@@ -176,7 +176,7 @@ pub(super) fn parse(
 
 #[cfg(test)]
 #[allow(non_snake_case)]
-mod tests {
+pub(super) mod tests {
     use super::super::tests::{assert_same, crooked, load, message, row, straight};
     use super::*;
     use barchan_geometry::Distortion;
@@ -230,6 +230,13 @@ mod tests {
             );
         }
         text + "</opencv_storage>\n"
+    }
+
+    /// The same rig as YAML and as XML.
+    pub(in super::super) fn samples() -> [String; 2] {
+        let mut all = intrinsics(&crooked());
+        all.extend(extrinsics(&crooked()));
+        [yaml(&all), xml(&all)]
     }
 
     #[test]

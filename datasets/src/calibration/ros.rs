@@ -90,7 +90,7 @@ fn camera(values: &Values<'_>) -> Result<Camera, DataError> {
 
 #[cfg(test)]
 #[allow(non_snake_case)]
-mod tests {
+pub(super) mod tests {
     use super::super::tests::{assert_same, crooked, load, message, row, straight};
     use super::*;
     use barchan_geometry::Rectification;
@@ -142,7 +142,7 @@ mod tests {
         )
     }
 
-    fn pair(rig: &Rig) -> [(&'static str, String); 2] {
+    pub(in super::super) fn pair(rig: &Rig) -> [(&'static str, String); 2] {
         let r = Rectification::new(rig);
         let p = [r.rig.fx, r.rig.fy, r.rig.cx, r.rig.cy];
         [

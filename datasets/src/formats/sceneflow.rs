@@ -105,12 +105,13 @@ fn open(dir: &Path) -> Result<PairSource, DataError> {
     } in passes
     {
         let mut scenes = Vec::new();
+        let asked = images.join(&inside);
         let parts = inside.iter().map(|part| part.to_string_lossy() + "-");
         find_scenes(&images, (parts.collect(), inside), 0, &mut scenes)?;
         if scenes.is_empty() {
             return Err(DataError::file(
-                &images,
-                "holds no left/ and right/ at any depth",
+                &asked,
+                "holds no left/ and right/ at any depth; open the folder that holds both",
             ));
         }
         for (prefix, inside) in scenes {
