@@ -2,7 +2,6 @@
 
 use barchan_datasets::check::Report;
 use barchan_datasets::{Plane, Rgb, StereoFrame};
-use barchan_geometry::RectifiedRig;
 use barchan_geometry::nalgebra::{Matrix3, Vector3};
 use image::RgbImage;
 use image::imageops::{FilterType, replace, resize};
@@ -68,16 +67,15 @@ pub fn contact_sheet(pairs: &[(StereoFrame, Option<Plane>)]) -> RgbImage {
 /// The matches of one frame: above, where they lie in the left and in the right image; below, how far
 /// rows of the right image are off, ten times as long, as they are and after correction. Green is
 /// within half a pixel, red beyond.
-pub fn row_errors(frame: &StereoFrame, rig: &RectifiedRig, report: &Report) -> RgbImage {
+pub fn row_errors(frame: &StereoFrame, report: &Report) -> RgbImage {
     let (left, right) = (bytes(&frame.left), bytes(&frame.right));
     let mut dark = left.clone();
-    dark.pixels_mut()
-        .for_each(|p| p.0 = p.0.map(|v| v / 2));
+    dark.pixels_mut().for_each(|p| p.0 = p.0.map(|v| v / 2));
     let (width, height) = left.dimensions();
     let mut panels = [left, right, dark.clone(), dark];
     let to_corrected = report
-        .rows
-        .and_then(|rows| rows.homography(rig).try_inverse())
+        .correction
+        .and_then(|correction| correction.right_homography.try_inverse())
         .unwrap_or(Matrix3::identity());
     // Marks that can be seen in a picture of any size.
     let half = (width / 320).max(1) as i32;
@@ -95,7 +93,13 @@ pub fn row_errors(frame: &StereoFrame, rig: &RectifiedRig, report: &Report) -> R
             };
             let length = (10.0 * error).abs().min(f64::from(height)) as i32;
             for k in 0..=length {
-                dot(&mut panels[panel], *x, y + f64::from(k) * error.signum(), half - 1, colour);
+                dot(
+                    &mut panels[panel],
+                    *x,
+                    y + f64::from(k) * error.signum(),
+                    half - 1,
+                    colour,
+                );
             }
             dot(&mut panels[panel], *x, *y, half, colour);
         }

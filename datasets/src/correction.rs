@@ -4,8 +4,8 @@ use barchan_geometry::{RectifiedRig, Trajectory};
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::pairs::no_frame;
 use crate::image_file::write_whole;
+use crate::pairs::no_frame;
 use crate::resample::remap;
 use crate::{DataError, Plane, Rgb, Sensors, StereoFrame, StereoSource};
 

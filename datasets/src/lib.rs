@@ -42,5 +42,3 @@ pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
 pub use synth::Synth;
 pub use text::read_planar;
 pub use write_folder::write_folder;
-
-use formats::folder;

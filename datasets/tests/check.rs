@@ -153,10 +153,18 @@ fn warp(image: &Rgb, from: impl Fn(f64, f64) -> (f64, f64)) -> Rgb {
     let pixel = |x: u32, y: u32| image.get_pixel(x.min(w - 1), y.min(h - 1)).0;
     Rgb::from_fn(w, h, |u, v| {
         let (x, y) = from(f64::from(u), f64::from(v));
-        let (x, y) = (x.clamp(0.0, f64::from(w - 1)), y.clamp(0.0, f64::from(h - 1)));
+        let (x, y) = (
+            x.clamp(0.0, f64::from(w - 1)),
+            y.clamp(0.0, f64::from(h - 1)),
+        );
         let (i, j) = (x as u32, y as u32);
         let (a, b) = (x.fract() as f32, y.fract() as f32);
-        let corners = [pixel(i, j), pixel(i + 1, j), pixel(i, j + 1), pixel(i + 1, j + 1)];
+        let corners = [
+            pixel(i, j),
+            pixel(i + 1, j),
+            pixel(i, j + 1),
+            pixel(i + 1, j + 1),
+        ];
         image::Rgb(std::array::from_fn(|c| {
             let [p, q, r, s] = corners.map(|pixel| pixel[c]);
             (p * (1.0 - a) + q * a) * (1.0 - b) + (r * (1.0 - a) + s * a) * b
@@ -233,11 +241,16 @@ fn rarer_faults_are_named_too() {
     let pairs = Planted::new(2);
     for (plant, fault, size, within) in [
         (Plant::Pitch(1.0), Fault::Pitch, 1.0, 0.1),
-        (Plant::Yaw(2.0), Fault::Yaw, 2.0, 0.2),
+        (Plant::Yaw(1.5), Fault::Yaw, 1.5, 0.2),
         (Plant::Gain(0.8), Fault::Exposure, 0.8, 0.02),
         (Plant::Blur(3), Fault::Blur, 0.0, 0.29),
         (Plant::Baseline(0.8), Fault::Baseline, 1.25, 0.03),
-        (Plant::FocalLength(1.06), Fault::FocalLength, 1.0 / 1.06, 0.02),
+        (
+            Plant::FocalLength(1.06),
+            Fault::FocalLength,
+            1.0 / 1.06,
+            0.02,
+        ),
     ] {
         let report = pairs.report(plant);
         assert_eq!(faults(&report), [fault], "{plant:?}: {:?}", report.findings);
@@ -328,10 +341,12 @@ fn real_pairs_have_the_faults_that_are_known_of_them() {
         ("arena-unlabelled", 3.1, vec![Fault::RowOffset]),
         ("arena-run1", 0.0, vec![]),
         ("devon1", -0.5, vec![Fault::RowOffset]),
-        ("kitti00-first21", 0.0, vec![]),
+        // Its calibration is known to be improvable (Cvisic, Markovic and Petrovic 2021), and the first
+        // metres of its truth are smoothed.
+        ("kitti00-first21", -0.2, vec![Fault::Yaw, Fault::Poses]),
         ("sceneflow-sample", 0.0, vec![]),
         ("middlebury2003/cones", 0.0, vec![]),
-        ("middlebury2014/trainingQ/Motorcycle", 0.1, vec![]),
+        ("middlebury2014/trainingQ/Motorcycle", -0.25, vec![]),
     ] {
         let Some(path) = shared(folder) else { continue };
         let source = open_as_stored(path.to_str().unwrap()).unwrap();

@@ -3,8 +3,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{Plane, StereoFrame, StereoSource, disparity_file, prefetch, read_rgb};
-use barchan_geometry::{RectifiedRig, Rig};
+use barchan_datasets::{
+    Plane, StereoFrame, StereoSource, disparity_file, load_rig, prefetch, read_rgb,
+};
+use barchan_geometry::RectifiedRig;
 use barchan_infer::Rejection;
 use barchan_terrain::{Cloud, DepthLimits};
 use clap::Parser;
@@ -65,7 +67,7 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
-    let (frames, rig) = open_frames(&args, output)?;
+    let frames = open_frames(&args, output)?;
     let mut engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     let rejection = (!args.no_reject).then_some(Rejection {
@@ -74,8 +76,9 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
 
     let bar = output.progress("infer", frames.len());
     let (mut milliseconds, mut density, mut colours) = (vec![], 0.0, None);
+    let mut clouds = false;
     for frame in frames {
-        let frame = frame?;
+        let (frame, rig) = frame?;
         let started = Instant::now();
         let mut map = engine
             .disparity(&frame.left, &frame.right)
@@ -99,6 +102,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             .save(&preview)
             .with_context(|| preview.display().to_string())?;
         if let Some(rig) = &rig {
+            clouds = true;
             let cloud = Cloud::from_disparity(
                 rig,
                 &frame.left,
@@ -128,14 +132,15 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         summary.engine,
         100.0 * summary.density,
         args.out.display(),
-        if rig.is_some() { " cloud/" } else { "" },
+        if clouds { " cloud/" } else { "" },
     );
     output.result(&summary, &text)
 }
 
-type Frames = Box<dyn ExactSizeIterator<Item = Result<StereoFrame>>>;
+/// Pairs, each with its rig where that is known.
+type Frames = Box<dyn ExactSizeIterator<Item = Result<(StereoFrame, Option<RectifiedRig>)>>>;
 
-fn open_frames(args: &Args, output: &Output) -> Result<(Frames, Option<RectifiedRig>)> {
+fn open_frames(args: &Args, output: &Output) -> Result<Frames> {
     if let (Some(left), Some(right)) = (&args.left, &args.right) {
         return single_pair(left, right, args.rig.as_deref(), output);
     }
@@ -143,25 +148,21 @@ fn open_frames(args: &Args, output: &Output) -> Result<(Frames, Option<Rectified
         bail!("give --data, or --left and --right");
     };
     let source: Arc<dyn StereoSource> = open_checked(data, &args.unchecked, output)?.into();
-    let rig = *source.rig();
     let order = match &args.keyframes {
         None => (0..source.len()).collect(),
         Some(list) => select(source.as_ref(), list)?,
     };
-    Ok((
-        Box::new(prefetch(source, order, 4).map(|f| f.map_err(Into::into))),
-        Some(rig),
-    ))
+    let frames = prefetch(Arc::clone(&source), order, 4);
+    Ok(Box::new(frames.map(move |frame| {
+        let frame = frame?;
+        let rig = *source.frame_rig(frame.index);
+        Ok((frame, Some(rig)))
+    })))
 }
 
-fn single_pair(
-    left: &Path,
-    right: &Path,
-    rig: Option<&Path>,
-    output: &Output,
-) -> Result<(Frames, Option<RectifiedRig>)> {
+fn single_pair(left: &Path, right: &Path, rig: Option<&Path>, output: &Output) -> Result<Frames> {
     let rig = match rig {
-        Some(path) => Some(Rig::load(path)?.as_rectified().with_context(|| {
+        Some(path) => Some(load_rig(&[path.to_owned()])?.as_rectified().with_context(|| {
             format!("{}: rectified = false\n  cure: put the pair into a folder with this rig, and give --data", path.display())
         })?),
         None => {
@@ -190,7 +191,7 @@ fn single_pair(
             rig.height
         );
     }
-    Ok((Box::new(std::iter::once(Ok(frame))), rig))
+    Ok(Box::new(std::iter::once(Ok((frame, rig)))))
 }
 
 /// Indices of the frames whose names stand in `list`.

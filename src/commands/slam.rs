@@ -67,6 +67,12 @@ struct Summary {
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let config = configuration(&args)?;
     let source: Arc<dyn StereoSource> = open_checked(&args.data, &args.unchecked, output)?.into();
+    if (0..source.len()).any(|i| source.frame_rig(i) != source.rig()) {
+        bail!(
+            "{}: the pairs are of several rigs\n  cure: give one sequence of one rig",
+            args.data
+        );
+    }
     let engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     out.write("config.toml", toml::to_string(&config)?)?;

@@ -127,7 +127,7 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     let (mut trainer, root, fresh) = match &args.resume {
-        Some(root) => (resume(root, output)?, root.clone(), false),
+        Some(root) => (resume(root, &args.unchecked, output)?, root.clone(), false),
         None => {
             let root = args.out.clone().unwrap_or_else(|| "runs/train".into());
             (create(&args, &root, output)?, root, true)
@@ -194,7 +194,7 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
     } else {
         args.data.clone()
     };
-    let sources = open_all(&data, output)?;
+    let sources = open_all(&data, &args.unchecked, output)?;
     let init = match (&args.init, args.finetune) {
         (Some(init), _) => Some(init.clone()),
         (None, true) => Some(match args.preset {
@@ -250,9 +250,9 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
     Ok(Trainer::create(root, config, sources, net)?)
 }
 
-fn resume(root: &Path, output: &Output) -> Result<Trainer> {
+fn resume(root: &Path, unchecked: &Unchecked, output: &Output) -> Result<Trainer> {
     let (_, mut config) = RunDir::open(root)?;
-    let sources = open_all(&config.data, output)?;
+    let sources = open_all(&config.data, unchecked, output)?;
     let range = config.net.max_disparity;
     let net = initial_net(&mut config, Some(range))?;
     Ok(Trainer::resume(root, sources, net)?)

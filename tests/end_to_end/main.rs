@@ -2,5 +2,6 @@
 
 mod bad_input;
 mod chain;
+mod data;
 mod program;
 mod smoke;

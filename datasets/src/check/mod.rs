@@ -35,7 +35,7 @@ pub enum Fault {
     RowOffset,
     /// The right camera looks up or down against the left one.
     Pitch,
-    /// The right camera is turned inwards or outwards.
+    /// The right camera is turned inwards or outwards, or a lens is not undistorted.
     Yaw,
     /// The right camera is turned about its optical axis.
     Roll,
@@ -47,6 +47,8 @@ pub enum Fault {
     Baseline,
     /// The focal length contradicts the true poses.
     FocalLength,
+    /// The true poses fit the images with no baseline.
+    Poses,
     /// Images are blurred.
     Blur,
     /// Images are over-exposed.
@@ -408,24 +410,24 @@ fn judge_pairing(pairing: Pairing, swapped: bool, findings: &mut Vec<Finding>) {
     }
 }
 
-/// Says what is wrong with the rows; whether anything is.
-fn judge_rows(
-    rig: &RectifiedRig,
-    rows: Option<&RowModel>,
-    findings: &mut Vec<Finding>,
-) -> bool {
+/// Says what is wrong with the rows; whether a homography would mend any of it.
+fn judge_rows(rig: &RectifiedRig, rows: Option<&RowModel>, findings: &mut Vec<Finding>) -> bool {
     let Some(rows) = rows.filter(|rows| rows.consistency() >= 0.6) else {
         return false;
     };
-    let before = findings.len();
+    let mut need_correction = false;
     let mut say = |fault, value: f64, pixels: f64, text: String| {
         if pixels.abs() > HARMLESS {
+            need_correction |= fault != Fault::Yaw;
             findings.push(Finding { fault, value, text });
         }
     };
     let half = Vector2::new(rig.width as f64, rig.height as f64) / 2.0;
     let [keystone, tilt, growth] = rows.reach;
-    let of = format!("over {} matches, spread {:.2} px", rows.matches, rows.spread);
+    let of = format!(
+        "over {} matches, spread {:.2} px",
+        rows.matches, rows.spread
+    );
     let lower = |v: f64| if v > 0.0 { "lower" } else { "higher" };
     say(
         Fault::RowOffset,
@@ -455,7 +457,7 @@ fn judge_rows(
         rows.yaw.to_degrees(),
         rows.yaw * rig.fy * keystone,
         format!(
-            "the right camera is yawed by {:.2} degrees: rows are {:.2} px off in the corners ({of})",
+            "rows are {1:.2} px off in the corners, as if the right camera were yawed by {0:.2} degrees ({of}); a lens that is not quite undistorted looks the same, and rows cannot tell which: calibrate again",
             rows.yaw.to_degrees().abs(),
             corner.abs()
         ),
@@ -480,11 +482,15 @@ fn judge_rows(
         format!(
             "the right images are {:.2} % {}: rows are {:.2} px off at top and bottom ({of})",
             100.0 * rows.scale.abs(),
-            if rows.scale > 0.0 { "larger" } else { "smaller" },
+            if rows.scale > 0.0 {
+                "larger"
+            } else {
+                "smaller"
+            },
             edge.abs()
         ),
     );
-    findings.len() > before
+    need_correction
 }
 
 /// The gain of the right images over the left.

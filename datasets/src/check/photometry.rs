@@ -85,13 +85,17 @@ pub(super) fn judge(pairs: &[&Photometry], findings: &mut Vec<Finding>) {
     if left.max(right) < BLURRED {
         blurred(
             left.max(right),
-            format!("the images are blurred (sharpness {left:.2} left, {right:.2} right; {BLURRED} is the least): focus, expose for a shorter time, or use smaller images"),
+            format!(
+                "the images are blurred (sharpness {left:.2} left, {right:.2} right; {BLURRED} is the least): focus, expose for a shorter time, or use smaller images"
+            ),
         );
     } else if left.min(right) < UNEVEN * left.max(right) {
         let side = if left < right { "left" } else { "right" };
         blurred(
             left.min(right),
-            format!("the {side} images are much less sharp (sharpness {left:.2} left, {right:.2} right): focus that camera, or clean it"),
+            format!(
+                "the {side} images are much less sharp (sharpness {left:.2} left, {right:.2} right): focus that camera, or clean it"
+            ),
         );
     } else {
         let soft = pairs

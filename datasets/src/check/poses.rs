@@ -23,14 +23,17 @@ pub struct PoseScale {
     clear: Option<Fault>,
     /// Points that were followed.
     pub points: usize,
+    /// Median distance between where they were seen and where poses and the better factor put them,
+    /// pixels.
+    pub error: f64,
 }
 
 /// A point seen by the rig, and again by its left camera after a known motion.
+#[allow(non_snake_case)]
 struct Track {
     rig: RectifiedRig,
     first: StereoPoint,
     second: Vector2<f64>,
-    #[allow(non_snake_case)]
     T_second_first: Se3,
 }
 
@@ -59,9 +62,9 @@ pub(super) fn pose_scale(
     }
     let (baseline, by_baseline) = fit_factor(&tracks, |t, factor| scaled(t, factor, 1.0));
     let (focal_length, by_focal) = fit_factor(&tracks, |t, factor| scaled(t, 1.0, factor));
-    if std::env::var("DBG").is_ok() { eprintln!("base {baseline} {:?} focal {focal_length} {:?}", median(&mut by_baseline.clone()), median(&mut by_focal.clone())); for l in looks { let ts: Vec<Track> = self::tracks(source,l,truth,rows).unwrap(); if ts.len()>5 { let (b,r)=fit_factor(&ts,|t,f|scaled(t,f,1.0)); eprintln!("{} n {} base {b:.3} med {:.2} move {:?}", l.frame, ts.len(), median(&mut r.clone()), ts[0].T_second_first.translation.vector.norm()); } } }
     let spread_of = |residuals: &[f64]| median(&mut residuals.to_vec());
-    let sigma = spread_of(&by_baseline).min(spread_of(&by_focal)).max(0.1);
+    let error = spread_of(&by_baseline).min(spread_of(&by_focal));
+    let sigma = error.max(0.1);
     let cost = |residuals: &[f64]| {
         let capped = residuals.iter().map(|r| (r / sigma).min(4.0).powi(2));
         capped.sum::<f64>() / residuals.len() as f64
@@ -80,6 +83,7 @@ pub(super) fn pose_scale(
         focal_length,
         clear,
         points: tracks.len(),
+        error,
     }))
 }
 
@@ -88,6 +92,19 @@ impl PoseScale {
     pub(super) fn judge(&self, rig: &RectifiedRig, findings: &mut Vec<Finding>) {
         /// Less than this is the noise of disparities and of most truth.
         const NOTICED: f64 = 0.02;
+        /// Farther off, in an image of 640 pixels, no rig explains the motion.
+        const EXPLAINED: f64 = 1.0;
+        if self.error > EXPLAINED * (rig.width as f64 / 640.0).max(1.0) {
+            findings.push(Finding {
+                fault: Fault::Poses,
+                value: self.error,
+                text: format!(
+                    "the true poses do not fit the images with any baseline: {} points are {:.1} px off at best; are they poses of the left camera, at the times of the images?",
+                    self.points, self.error
+                ),
+            });
+            return;
+        }
         let (factor, fault) = match self.clear {
             Some(Fault::FocalLength) => (self.focal_length, Fault::FocalLength),
             _ => (self.baseline, Fault::Baseline),
@@ -228,9 +245,8 @@ fn scaled(track: &Track, baseline: f64, focal_length: f64) -> f64 {
 /// not vote (a grid, then a golden-section search: one unknown needs no derivatives), and the
 /// distances there.
 fn fit_factor(tracks: &[Track], distance: impl Fn(&Track, f64) -> f64) -> (f64, Vec<f64>) {
-    let distances = |log: f64| -> Vec<f64> {
-        tracks.iter().map(|t| distance(t, log.exp())).collect()
-    };
+    let distances =
+        |log: f64| -> Vec<f64> { tracks.iter().map(|t| distance(t, log.exp())).collect() };
     let cost = |log: f64| -> f64 { distances(log).into_iter().map(|d| d.min(3.0)).sum() };
     let step = 0.02;
     let reach = (2f64.ln() / step) as i32;

@@ -15,7 +15,8 @@ pub struct RowModel {
     /// Rotation about the camera's x axis, radians. It shifts rows too, but more towards the top and
     /// the bottom: `offset` and `pitch` are told apart by that, and one of them is zero.
     pub pitch: f64,
-    /// Rotation about the y axis, radians: a keystone.
+    /// Rotation about the y axis, radians, as far as rows tell: a keystone, which some lens
+    /// distortion makes too.
     pub yaw: f64,
     /// Rotation about the optical axis, radians; positive: the right side of the image lies lower.
     pub roll: f64,
@@ -106,11 +107,12 @@ impl RowModel {
         Some(model)
     }
 
-    /// Where each pixel of the rectified right image lies in the given one.
+    /// Where each pixel of the rectified right image lies in the given one, but for the keystone: were
+    /// it distortion and not yaw, taking it for yaw would falsify every disparity.
     pub fn homography(&self, rig: &RectifiedRig) -> Matrix3<f64> {
         homography(
             rig,
-            &Parameters::from([self.offset, self.pitch, self.yaw, self.roll, self.scale]),
+            &Parameters::from([self.offset, self.pitch, 0.0, self.roll, self.scale]),
         )
     }
 
@@ -171,11 +173,7 @@ fn deviation(residuals: &[f64]) -> f64 {
 /// Iteratively reweighted least squares with Tukey's biweight over the causes that are free.
 /// Returns the parameters, the cost in variances, and the standard deviation that it was measured
 /// with: `sigma`, or that of these residuals.
-fn fit_causes(
-    matches: &[RowMatch],
-    free: [bool; 5],
-    sigma: Option<f64>,
-) -> (Parameters, f64, f64) {
+fn fit_causes(matches: &[RowMatch], free: [bool; 5], sigma: Option<f64>) -> (Parameters, f64, f64) {
     let mut offsets: Vec<f64> = matches.iter().map(|m| m.right.y - m.left.y).collect();
     let mut p = Parameters::zeros();
     if free[0] {

@@ -8,7 +8,6 @@ use crate::DataError;
 use crate::calibration::{find_calibration, load_rig_of_size};
 use crate::image_file::image_size;
 use crate::listing::{DISPARITIES, IMAGES, list, pair_up};
-pub(crate) use crate::pairs::no_frame;
 use crate::pairs::{Calibrated, Coding, Pair, PairSource, TrueDisparity};
 use crate::text::{read_planar, read_times};
 

@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
-use crate::folder::no_frame;
+use crate::pairs::no_frame;
 use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource};
 use ground::{CELL, Ground, ROUTE_RADIUS};
 use noise::add_noise;

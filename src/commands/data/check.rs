@@ -1,7 +1,7 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::check::{Report, check};
+use barchan_datasets::check::{Fault, Report, check};
 use barchan_datasets::{Correction, dataset_folder, open, open_as_stored};
 use clap::Parser;
 use serde::Serialize;
@@ -51,8 +51,7 @@ pub fn run(args: Args, output: &Output) -> Result<bool> {
     let report = check(source.as_ref())?;
 
     let frame = source.frame(report.sample.frame)?;
-    let rig = source.frame_rig(report.sample.frame);
-    row_errors(&frame, rig, &report)
+    row_errors(&frame, &report)
         .save(&args.picture)
         .with_context(|| args.picture.display().to_string())?;
 
@@ -100,8 +99,13 @@ fn text(args: &Args, report: &Report, corrected: bool, fixed: &Option<PathBuf>) 
     if let Some([low, _, high]) = report.disparity {
         text += &format!("; disparities from {low:.0} to {high:.0} px");
     }
-    if let Some(poses) = &report.poses {
-        text += &format!("; baseline {:.3} times what true poses say", 1.0 / poses.baseline);
+    if let Some(poses) = &report.poses
+        && !report.has(Fault::Poses)
+    {
+        text += &format!(
+            "; baseline {:.3} times what true poses say",
+            1.0 / poses.baseline
+        );
     }
     text += "\n";
     if report.findings.is_empty() {

@@ -4,7 +4,7 @@ mod info;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
-use barchan_datasets::{StereoSource, load_rig, open, write_folder};
+use barchan_datasets::{load_rig, open, write_folder};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
 
@@ -107,5 +107,8 @@ fn import_rig(files: &[PathBuf], out: PathBuf, output: &Output) -> Result<()> {
             "not rectified: images are rectified when they are read"
         }
     );
-    output.result(&serde_json::json!({ "out": out, "baseline": rig.baseline(), "rectified": rig.rectified }), &text)
+    output.result(
+        &serde_json::json!({ "out": out, "baseline": rig.baseline(), "rectified": rig.rectified }),
+        &text,
+    )
 }

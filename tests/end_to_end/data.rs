@@ -1,0 +1,161 @@
+//! `data info | check | rectify | rig`: what a user does with pairs before anything else.
+
+use std::path::Path;
+
+use crate::program::{barchan, json, refused, text};
+
+/// A rendered sequence long enough to be checked.
+fn sequence(dir: &Path) -> std::path::PathBuf {
+    let data = dir.join("data");
+    barchan()
+        .args([
+            "data",
+            "synth",
+            "synth:seed=5,frames=16,width=224,height=160",
+        ])
+        .args(["--out", text(&data)])
+        .assert()
+        .success();
+    data
+}
+
+fn check(data: &Path, flags: &[&str], status: i32) -> serde_json::Value {
+    let picture = data.with_extension("png");
+    let output = barchan()
+        .args([
+            "data",
+            "check",
+            text(data),
+            "--json",
+            "--picture",
+            text(&picture),
+        ])
+        .args(flags)
+        .output()
+        .unwrap();
+    assert_eq!(
+        output.status.code(),
+        Some(status),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    assert!(image::open(&picture).is_ok());
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn faults(report: &serde_json::Value) -> Vec<&str> {
+    let findings = report["findings"].as_array().unwrap();
+    findings
+        .iter()
+        .map(|f| f["fault"].as_str().unwrap())
+        .collect()
+}
+
+#[test]
+fn swapped_images_stop_a_command_until_they_are_mended() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = sequence(dir.path());
+    assert!(faults(&check(&data, &[], 0)).is_empty());
+    let (left, right, aside) = (data.join("left"), data.join("right"), data.join("aside"));
+    std::fs::rename(&left, &aside).unwrap();
+    std::fs::rename(&right, &left).unwrap();
+    std::fs::rename(&aside, &right).unwrap();
+    // The truth is that of the other camera now.
+    std::fs::remove_dir_all(data.join("disparity")).unwrap();
+
+    assert_eq!(faults(&check(&data, &[], 1)), ["swapped"]);
+    let out = dir.path().join("out");
+    let infer = ["infer", "--data", text(&data), "--out", text(&out)];
+    let message = refused(&infer);
+    assert!(
+        message.contains("swapped") && message.contains("--fix"),
+        "{message}"
+    );
+    assert!(!out.exists());
+
+    assert_eq!(faults(&check(&data, &["--fix"], 0)), ["swapped"]);
+    assert!(faults(&check(&data, &[], 0)).is_empty());
+    assert_eq!(json(&infer)["frames"], 16);
+    // Measured anew, not on top of the correction.
+    assert_eq!(faults(&check(&data, &["--fix"], 0)), ["swapped"]);
+
+    let rectified = dir.path().join("rectified");
+    barchan()
+        .args(["data", "rectify", text(&data), "--out", text(&rectified)])
+        .assert()
+        .success();
+    assert!(!rectified.join("correction.toml").exists());
+    assert!(faults(&check(&rectified, &[], 0)).is_empty());
+}
+
+#[test]
+fn a_slip_of_the_right_images_is_mended_by_shifting_them_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = sequence(dir.path());
+    // Every right image becomes that of two frames earlier.
+    for index in (2..16).rev() {
+        let name = |i: usize| data.join(format!("right/{i:06}.png"));
+        std::fs::copy(name(index - 2), name(index)).unwrap();
+    }
+    let report = check(&data, &["--fix"], 0);
+    assert_eq!(faults(&report), ["slipped"]);
+    assert_eq!(report["correction"]["right_frame_shift"], 2);
+    assert!(faults(&check(&data, &[], 0)).is_empty());
+    let info = json(&[
+        "data",
+        "info",
+        text(&data),
+        "--picture",
+        text(&dir.path().join("i.png")),
+    ]);
+    assert_eq!(info["frames"], 14);
+    assert_eq!(info["true_disparity"], true);
+
+    std::fs::write(data.join("correction.toml"), "right_frame_shift = 99\n").unwrap();
+    let message = refused(&["data", "info", text(&data)]);
+    assert!(message.contains("correction.toml"), "{message}");
+}
+
+#[test]
+fn info_tells_what_there_is_and_draws_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let picture = dir.path().join("sheet.png");
+    let info = json(&[
+        "data",
+        "info",
+        "synth:seed=2,frames=5,width=128,height=96",
+        "--picture",
+        text(&picture),
+    ]);
+    assert_eq!(
+        (&info["frames"], &info["rig"]["width"]),
+        (&5.into(), &128.into())
+    );
+    assert!(info["true_path"].as_f64().unwrap() > 0.1);
+    let [near, far] = [0, 2].map(|k| info["depth"][k].as_f64().unwrap());
+    assert!(0.3 < near && near < far, "{near} {far}");
+    // Left, right and truth in five rows.
+    assert_eq!(image::open(&picture).unwrap().width(), 1200);
+}
+
+#[test]
+fn the_calibration_of_another_tool_becomes_a_rig() {
+    let dir = tempfile::tempdir().unwrap();
+    let (calibration, rig) = (dir.path().join("calib.txt"), dir.path().join("rig.toml"));
+    std::fs::write(
+        &calibration,
+        "cam0=[999.4 0 294.2; 0 999.4 252.9; 0 0 1]\ncam1=[999.4 0 326.9; 0 999.4 252.9; 0 0 1]\ndoffs=32.7\nbaseline=193.0\nwidth=741\nheight=497\nndisp=70\n",
+    )
+    .unwrap();
+    let made = json(&["data", "rig", text(&calibration), "--out", text(&rig)]);
+    assert!((made["baseline"].as_f64().unwrap() - 0.193).abs() < 1e-9);
+    assert!(std::fs::read_to_string(&rig).unwrap().contains("741"));
+    let message = refused(&[
+        "data",
+        "rig",
+        text(&dir.path().join("absent.yaml")),
+        "--out",
+        text(&rig),
+    ]);
+    assert!(message.contains("absent.yaml"), "{message}");
+}
