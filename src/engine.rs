@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Runtime};
+use barchan_infer::{BlockMatching, BurnEngine, DisparityEngine, OnnxEngine, Runtime, SemiGlobal};
 use barchan_model::{Device, StereoNet, weights};
 use barchan_train::RunDir;
 
@@ -31,12 +31,16 @@ pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
     Ok(weights::load(&path, device)?)
 }
 
-/// The engine for a model: ONNX Runtime for `x.onnx`, Burn for weights and shipped names.
+/// The engine for a model: ONNX Runtime for `x.onnx`, Burn for weights and shipped names, `sgm` and
+/// `bm` without any network, `sgm:192` to search 192 disparities.
 pub fn load_engine(
     model: &str,
     runtime: Option<&Path>,
     threads: usize,
 ) -> Result<Box<dyn DisparityEngine>> {
+    if let Some(engine) = classical(model)? {
+        return Ok(engine);
+    }
     let path = Path::new(model);
     if path.extension().is_some_and(|e| e == "onnx") {
         // A missing file is the more likely mistake, and the cheaper to find.
@@ -47,6 +51,38 @@ pub fn load_engine(
     let device = Device::flex();
     let net = load_net(model, &device)?;
     Ok(Box::new(BurnEngine::new(net, device, model)))
+}
+
+/// The matcher without a network that `model` names, if it does.
+fn classical(model: &str) -> Result<Option<Box<dyn DisparityEngine>>> {
+    let (name, range) = match model.split_once(':') {
+        Some((name, range)) => (name, Some(range)),
+        None => (model, None),
+    };
+    if !["sgm", "bm"].contains(&name) {
+        return Ok(None);
+    }
+    let range = range
+        .map(|text| {
+            text.parse()
+                .ok()
+                .filter(|range| (1..=2048).contains(range))
+                .with_context(|| {
+                    format!("{model}: \"{text}\" is no number of disparities, 1 to 2048")
+                })
+        })
+        .transpose()?;
+    Ok(Some(if name == "sgm" {
+        Box::new(SemiGlobal {
+            range,
+            ..SemiGlobal::default()
+        })
+    } else {
+        Box::new(BlockMatching {
+            range,
+            ..BlockMatching::default()
+        })
+    }))
 }
 
 /// Shipped names, for messages.

@@ -65,7 +65,6 @@ impl DisparityMap {
 }
 
 /// Refuses a pair of two sizes, and an empty one.
-#[cfg(any(feature = "burn", feature = "onnxruntime"))]
 pub(crate) fn check_sizes(left: &Rgb, right: &Rgb) -> Result<(), InferError> {
     let (left, right) = (left.dimensions(), right.dimensions());
     if left != right || left.0 == 0 || left.1 == 0 {

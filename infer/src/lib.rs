@@ -1,7 +1,8 @@
 //! Disparity engines: a rectified pair in; disparity, standard deviation and confidence out.
 //!
 //! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
-//! line see disparity, whoever makes it; [`Rejection`], which marks as unknown what the pair itself
+//! line see disparity, whoever makes it; [`SemiGlobal`] and [`BlockMatching`], which need no model;
+//! [`Rejection`], which marks as unknown what the pair itself
 //! contradicts. Engines stand behind features: `burn`, `onnxruntime`.
 //!
 //! What it promises: any image size; disparity positive (`x_right = x_left - d`), NaN is unknown.
@@ -10,6 +11,7 @@
 
 #[cfg(feature = "burn")]
 mod burn_engine;
+mod classical;
 mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
@@ -17,6 +19,7 @@ mod rejection;
 
 #[cfg(feature = "burn")]
 pub use burn_engine::BurnEngine;
+pub use classical::{BlockMatching, SemiGlobal};
 pub use engine::{DisparityEngine, DisparityMap, InferError};
 #[cfg(feature = "onnxruntime")]
 pub use onnxruntime::{OnnxEngine, Runtime};

@@ -35,7 +35,8 @@ pub struct Args {
     /// The rig of the single pair; without it there is no cloud
     #[arg(long)]
     rig: Option<PathBuf>,
-    /// x.onnx, x.safetensors, a run of `barchan train`, or a shipped name
+    /// x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
+    /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
     #[arg(long, default_value = "tiny")]
     model: String,
     /// Only the frames named in this file, one name a line

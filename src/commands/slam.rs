@@ -24,7 +24,8 @@ pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
     data: String,
-    /// Disparity at key frames: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name
+    /// Disparity at key frames: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
+    /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
     #[arg(long, default_value = "tiny")]
     model: String,
     /// The run directory that is written
