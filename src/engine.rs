@@ -73,15 +73,9 @@ fn classical(model: &str) -> Result<Option<Box<dyn DisparityEngine>>> {
         })
         .transpose()?;
     Ok(Some(if name == "sgm" {
-        Box::new(SemiGlobal {
-            range,
-            ..SemiGlobal::default()
-        })
+        Box::new(SemiGlobal::new(range))
     } else {
-        Box::new(BlockMatching {
-            range,
-            ..BlockMatching::default()
-        })
+        Box::new(BlockMatching::new(range))
     }))
 }
 

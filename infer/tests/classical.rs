@@ -8,14 +8,8 @@ use barchan_infer::{BlockMatching, DisparityEngine, InferError, SemiGlobal};
 fn engines(range: usize) -> [Box<dyn DisparityEngine>; 2] {
     let range = Some(range);
     [
-        Box::new(SemiGlobal {
-            range,
-            ..SemiGlobal::default()
-        }),
-        Box::new(BlockMatching {
-            range,
-            ..BlockMatching::default()
-        }),
+        Box::new(SemiGlobal::new(range)),
+        Box::new(BlockMatching::new(range)),
     ]
 }
 
@@ -90,6 +84,20 @@ fn the_left_border_is_searched_as_far_as_the_right_image_goes() {
 }
 
 #[test]
+fn a_large_image_is_worked_on_in_strips_that_leave_no_seam() {
+    // Strips end inside: the costs of the whole would take 350 MB.
+    let (left, right) = pair((700, 1000), |_, y| 100.0 + 0.3 * y, 1.0);
+    let map = SemiGlobal::new(Some(500)).disparity(&left, &right).unwrap();
+    for y in 0..1000 {
+        let row = (480..690).filter(|x| {
+            let d = f64::from(map.disparity.get_pixel(*x, y).0[0]);
+            (d - 100.0 - 0.3 * f64::from(y)).abs() < 1.0
+        });
+        assert!(row.count() > 170, "row {y}");
+    }
+}
+
+#[test]
 fn a_slope_is_resolved_to_a_fraction_of_a_pixel() {
     let d = |x: f64, y: f64| 12.0 + 0.05 * x + 0.08 * y;
     let (left, right) = pair((200, 120), d, 1.0);
@@ -130,12 +138,7 @@ fn what_only_the_left_camera_sees_is_unknown() {
         };
         image::Rgb([texture(x, y); 3])
     });
-    let map = SemiGlobal {
-        range: Some(64),
-        ..SemiGlobal::default()
-    }
-    .disparity(&left, &right)
-    .unwrap();
+    let map = SemiGlobal::new(Some(64)).disparity(&left, &right).unwrap();
     let known = |columns: std::ops::Range<u32>, value: f64| {
         let pixels = (40..80).flat_map(|y| columns.clone().map(move |x| (x, y)));
         let of = pixels.clone().count();
@@ -208,12 +211,9 @@ fn real_pairs_are_matched_as_well_as_by_opencv() {
         let source = open_as_stored(path.to_str().unwrap()).unwrap();
         let frame = source.frame(0).unwrap();
         let truth = source.true_disparity(0).unwrap().unwrap();
-        let map = SemiGlobal {
-            range: Some(64),
-            ..SemiGlobal::default()
-        }
-        .disparity(&frame.left, &frame.right)
-        .unwrap();
+        let map = SemiGlobal::new(Some(64))
+            .disparity(&frame.left, &frame.right)
+            .unwrap();
         let (over_all, over_own) = bad2(&map.disparity, &truth);
         println!("{scene}: bad2 {over_all:.3} over all, {over_own:.3} over its own");
         assert!(over_own <= own && over_all <= 0.18, "{over_all} {over_own}");

@@ -12,6 +12,7 @@ import traceback
 from pathlib import Path
 
 import files
+import matching
 import network
 import rasters
 import trajectory
@@ -49,6 +50,9 @@ def main() -> None:
         cases = network.cases(data, shared, work)
         network.check_disparity(table, barchan, model, weights, cases, work)
 
+    def matchers(table: Table) -> None:
+        matching.check(table, barchan, shared, work)
+
     def trajectories(table: Table) -> None:
         cases = {
             "made up": trajectory.made_up_case(work),
@@ -68,7 +72,7 @@ def main() -> None:
         files.check_cloud(table, work / "map" / "cloud.ply")
 
     table = Table()
-    for part in (prepare, exported, engines, trajectories, terrain, formats):
+    for part in (prepare, exported, engines, matchers, trajectories, terrain, formats):
         try:
             part(table)
         except Exception as error:  # One part that cannot run must not hide the others' figures.

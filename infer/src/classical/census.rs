@@ -1,5 +1,7 @@
 //! What a pixel's surroundings look like, whatever the exposure.
 
+use std::ops::Range;
+
 use barchan_datasets::Plane;
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -87,15 +89,21 @@ fn census_row(rows: &[&[i16]; 2 * RADIUS_Y + 1], out: &mut [u64]) {
     }
 }
 
-/// Hamming distances `[y][x][d]` between pixel `x` of the left image and `x - d` of the right one.
-/// Where the right image ends, the cost is [`UNSEEN`].
-pub(super) fn distances(left: &Census, right: &Census, range: usize) -> Vec<u8> {
+/// Hamming distances `[y][x][d]` between pixel `x` of some rows of the left image and `x - d` of the
+/// right one. Where the right image ends, the cost is [`UNSEEN`].
+pub(super) fn distances(
+    left: &Census,
+    right: &Census,
+    rows: Range<usize>,
+    range: usize,
+    costs: &mut [u8],
+) {
     let width = left.width;
-    let mut costs = vec![0u8; width * left.height * range];
+    let pixels = rows.start * width..rows.end * width;
     costs
         .par_chunks_mut((width * range).max(1))
-        .zip(left.bits.par_chunks(width.max(1)))
-        .zip(right.bits.par_chunks(width.max(1)))
+        .zip(left.bits[pixels.clone()].par_chunks(width.max(1)))
+        .zip(right.bits[pixels].par_chunks(width.max(1)))
         .for_each(|((costs, left), right)| {
             // Reversed, so that growing disparities are growing addresses.
             let mut reversed = vec![0; width + range];
@@ -104,7 +112,6 @@ pub(super) fn distances(left: &Census, right: &Census, range: usize) -> Vec<u8> 
             }
             distance_row(left, &reversed, range, costs);
         });
-    costs
 }
 
 #[multiversion(targets(

@@ -4,7 +4,6 @@ use barchan_datasets::Plane;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::CostVolume;
 use crate::DisparityMap;
 
 /// Left and right may differ by this much, pixels.
@@ -13,31 +12,41 @@ const AGREE: usize = 1;
 const SPECKLE: usize = 100;
 const CONNECTED: f32 = 1.0;
 
+/// What was decided of a pixel.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Pixel {
+    disparity: f32,
+    sigma: f32,
+    confidence: f32,
+}
+
 /// The winner of each pixel, to a fraction of a pixel; unknown where the right image disagrees or
-/// ends, and in speckles.
+/// ends.
 ///
-/// `terms` is how many costs each sum holds; `sums_of_row` fills the sums `[x][d]` of a row.
-pub(super) fn finish(
-    volume: &CostVolume,
+/// `terms` is how many costs each sum holds; `sums_of_row` fills the sums `[x][d]` of a row, counted
+/// from 0 in `pixels`.
+pub(super) fn decide(
+    pixels: &mut [Pixel],
+    (width, range): (usize, usize),
     terms: f32,
     sums_of_row: impl Fn(usize, &mut [u16]) + Sync,
-) -> DisparityMap {
-    let (width, height, range) = (volume.width, volume.height, volume.range);
-    let mut pixels = vec![Pixel::default(); width * height];
-    pixels
-        .par_chunks_mut(width.max(1))
-        .enumerate()
-        .for_each_init(
-            || vec![0u16; width * range],
-            |sums, (y, row)| {
-                sums_of_row(y, sums);
-                decide(sums, range, terms, row);
-            },
-        );
+) {
+    pixels.par_chunks_mut(width).enumerate().for_each_init(
+        || vec![0u16; width * range],
+        |sums, (y, row)| {
+            sums_of_row(y, sums);
+            decide_row(sums, range, terms, row);
+        },
+    );
+}
+
+/// The map, without speckles, each disparity the median of its neighbours.
+pub(super) fn clean(pixels: &[Pixel], width: usize) -> DisparityMap {
     let mut disparity: Vec<f32> = pixels.iter().map(|p| p.disparity).collect();
     remove_speckles(&mut disparity, width);
     let disparity = median3(&disparity, width);
     let plane = |values: Vec<f32>| {
+        let height = values.len() / width;
         // One value a pixel by construction.
         Plane::from_raw(width as u32, height as u32, values).unwrap_or_default()
     };
@@ -48,20 +57,13 @@ pub(super) fn finish(
     }
 }
 
-#[derive(Clone, Copy, Default)]
-struct Pixel {
-    disparity: f32,
-    sigma: f32,
-    confidence: f32,
-}
-
 #[multiversion(targets(
     "x86_64+avx512f+avx512bw+avx512vl",
     "x86_64+avx2",
     "x86_64+sse4.1",
     "aarch64+neon"
 ))]
-fn decide(sums: &[u16], range: usize, terms: f32, row: &mut [Pixel]) {
+fn decide_row(sums: &[u16], range: usize, terms: f32, row: &mut [Pixel]) {
     let width = row.len();
     let of = |x: usize| &sums[x * range..][..range];
     // The same sums seen from the right image, whose pixel x is the left one's x + d: the least sum

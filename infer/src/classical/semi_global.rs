@@ -1,29 +1,29 @@
 use barchan_datasets::Rgb;
 use multiversion::multiversion;
 
-use super::finish::finish;
-use super::{BLOCK, CostVolume, census};
+use super::finish::decide;
+use super::{BLOCK, CostVolume, census, match_in_strips};
 use crate::engine::check_sizes;
 use crate::{DisparityEngine, DisparityMap, InferError};
 
 /// Semi-global matching (Hirschmueller 2008) of census transforms along eight paths, to a fraction of
 /// a pixel, without pixels that left and right see differently and without speckles.
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug, Default)]
 pub struct SemiGlobal {
-    /// Disparities `0..range` are searched, rounded up to 32; a quarter of the width when not given.
-    pub range: Option<usize>,
-    /// Cost of a disparity that changes by one along a path.
-    pub small_step: u8,
-    /// Cost of any larger change; at most 190, so that path costs fit in a byte.
-    pub large_step: u8,
+    range: Option<usize>,
+    // Kept from pair to pair: fresh memory would cost as much as the work.
+    volume: CostVolume,
+    down: Vec<u16>,
+    up: Vec<u16>,
 }
 
-impl Default for SemiGlobal {
-    fn default() -> Self {
+impl SemiGlobal {
+    /// Searches disparities `0..range`, rounded up to 32; a quarter of the width, 64 to 512, when not
+    /// given.
+    pub fn new(range: Option<usize>) -> Self {
         Self {
-            range: None,
-            small_step: 11,
-            large_step: 90,
+            range,
+            ..Self::default()
         }
     }
 }
@@ -35,48 +35,45 @@ impl DisparityEngine for SemiGlobal {
 
     fn disparity(&mut self, left: &Rgb, right: &Rgb) -> Result<DisparityMap, InferError> {
         check_sizes(left, right)?;
-        let volume = CostVolume::new(left, right, self.range);
-        let steps = Steps {
-            small: self.small_step,
-            large: self.large_step.min(u8::MAX - census::MOST - 1),
-        };
-        // Four paths come from above and the left, four from below and the right; the two groups
-        // know nothing of each other.
-        let (down, up) = rayon::join(
-            || aggregate(&volume, steps, false),
-            || aggregate(&volume, steps, true),
-        );
-        let row = volume.width * volume.range;
-        Ok(finish(&volume, 8.0, |y, sums| {
-            add(&down[y * row..][..row], &up[y * row..][..row], sums);
-        }))
+        let (down, up) = (&mut self.down, &mut self.up);
+        let volume = &mut self.volume;
+        Ok(match_in_strips(
+            left,
+            right,
+            self.range,
+            volume,
+            |volume, rows, pixels| {
+                // Four paths come from above and the left, four from below and the right; the two
+                // groups know nothing of each other.
+                rayon::join(
+                    || aggregate(volume, false, down),
+                    || aggregate(volume, true, up),
+                );
+                let row = volume.width * volume.range;
+                decide(pixels, (volume.width, volume.range), 8.0, |y, sums| {
+                    let at = (rows.start + y) * row..(rows.start + y + 1) * row;
+                    add(&down[at.clone()], &up[at], sums);
+                });
+            },
+        ))
     }
 }
 
-/// The two penalties of eq. 11 of the paper.
-#[derive(Clone, Copy)]
-struct Steps {
-    small: u8,
-    large: u8,
-}
+/// Costs of a disparity that changes along a path by one, and by more (eq. 11 of the paper). With the
+/// 62 bits of a census they fit in a byte.
+const SMALL_STEP: u8 = 11;
+const LARGE_STEP: u8 = 90;
+const _: () = assert!(LARGE_STEP < u8::MAX - census::MOST);
 
 /// Path costs of a pixel, `range` of them between two guards that no minimum takes.
 const GUARDS: usize = 2;
 
 /// Sums of the costs of the four paths that reach a pixel from the rows already seen and along its
 /// own row: from the top left corner on, or, with `from_below`, from the bottom right one.
-fn aggregate(volume: &CostVolume, steps: Steps, from_below: bool) -> Vec<u16> {
-    let mut sums = vec![0u16; volume.costs.len()];
-    aggregate_into(
-        volume.width,
-        volume.height,
-        volume.range,
-        &volume.costs,
-        steps,
-        from_below,
-        &mut sums,
-    );
-    sums
+fn aggregate(volume: &CostVolume, from_below: bool, sums: &mut Vec<u16>) {
+    sums.resize(volume.costs.len(), 0);
+    let size = (volume.width, volume.rows, volume.range);
+    aggregate_into(size, &volume.costs, from_below, sums);
 }
 
 #[multiversion(targets(
@@ -86,11 +83,8 @@ fn aggregate(volume: &CostVolume, steps: Steps, from_below: bool) -> Vec<u16> {
     "aarch64+neon"
 ))]
 fn aggregate_into(
-    width: usize,
-    height: usize,
-    range: usize,
+    (width, height, range): (usize, usize, usize),
     costs: &[u8],
-    steps: Steps,
     from_below: bool,
     sums: &mut [u16],
 ) {
@@ -120,14 +114,13 @@ fn aggregate_into(
                     &before[from * slot..][..slot],
                     least,
                     cost,
-                    steps,
                     &mut now[to * slot..][..slot],
                     sum,
                     path == 0,
                 );
             }
             let [from, to] = &mut along;
-            least_along = step(from, least_along, cost, steps, to, sum, false);
+            least_along = step(from, least_along, cost, to, sum, false);
             along.swap(0, 1);
         }
         std::mem::swap(&mut before, &mut now);
@@ -139,20 +132,12 @@ fn aggregate_into(
 /// back, whose least is `least`; 255 starts a path. Adds to `sum`, or begins it. Returns the least
 /// cost.
 #[inline(always)]
-fn step(
-    from: &[u8],
-    least: u8,
-    cost: &[u8],
-    steps: Steps,
-    to: &mut [u8],
-    sum: &mut [u16],
-    first: bool,
-) -> u8 {
+fn step(from: &[u8], least: u8, cost: &[u8], to: &mut [u8], sum: &mut [u16], first: bool) -> u8 {
     let starts = least == u8::MAX;
     let cap = if starts {
         0
     } else {
-        least.saturating_add(steps.large)
+        least.saturating_add(LARGE_STEP)
     };
     let least = if starts { 0 } else { least };
     let mut lowest = [u8::MAX; BLOCK];
@@ -164,7 +149,7 @@ fn step(
         let cost = &cost[block..block + BLOCK];
         let sum = &mut sum[block..block + BLOCK];
         for d in 0..BLOCK {
-            let change = nearer[d].min(farther[d]).saturating_add(steps.small);
+            let change = nearer[d].min(farther[d]).saturating_add(SMALL_STEP);
             here[d] = same[d].min(change).min(cap) - least.min(cap) + cost[d];
         }
         for d in 0..BLOCK {
