@@ -31,6 +31,29 @@ pub(super) struct Footprint {
     pub minor: f32,
 }
 
+impl Footprint {
+    /// The area between two steps.
+    pub fn new(a: Vector2<f32>, b: Vector2<f32>) -> Self {
+        let major = if a.norm_squared() > b.norm_squared() {
+            a
+        } else {
+            b
+        };
+        Self {
+            major,
+            minor: a.perp(&b).abs() / major.norm().max(1e-9),
+        }
+    }
+
+    /// The same in other units.
+    pub fn scaled(&self, by: f32) -> Self {
+        Self {
+            major: self.major * by,
+            minor: self.minor * by,
+        }
+    }
+}
+
 impl<const C: usize> Texture<C> {
     /// `side` is a power of two and `image` has its square of values.
     pub fn new(side: usize, image: Vec<[f32; C]>) -> Self {

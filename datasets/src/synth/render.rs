@@ -1,0 +1,178 @@
+use barchan_geometry::{Camera, RectifiedRig, Se3};
+use nalgebra::{Point3, UnitQuaternion, Vector2, Vector3};
+use rayon::prelude::*;
+
+use super::surface::Hit;
+
+/// What can be looked at.
+pub(super) trait Scene: Sync {
+    /// The first thing that a ray meets.
+    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>) -> Option<Hit>;
+
+    /// The light (linear red, green, blue) that comes back along a ray from what it met, averaged
+    /// over the pixel.
+    fn light(&self, look: &Look, hit: Option<&Hit>) -> Vector3<f32>;
+}
+
+/// A ray and its pixel.
+pub(super) struct Look {
+    pub origin: Point3<f64>,
+    pub ray: Vector3<f64>,
+    /// How the ray changes across the pixel along columns and rows (Igehy 1999).
+    pub steps: [Vector3<f64>; 2],
+}
+
+/// A camera at a place.
+#[allow(non_snake_case)]
+pub(super) struct View<'a> {
+    pub width: usize,
+    pub height: usize,
+    pub origin: Point3<f64>,
+    /// Turns directions of the camera that `lens` belongs to into the world.
+    R_world_cam: UnitQuaternion<f64>,
+    focal: [f64; 2],
+    lens: Lens<'a>,
+}
+
+enum Lens<'a> {
+    Pinhole { cx: f64, cy: f64 },
+    Bent(&'a Camera),
+}
+
+impl<'a> View<'a> {
+    /// A camera of a rectified rig, `shift` metres to the right of the left one. Its rays have z = 1
+    /// in the camera, so that the parameter along them is the depth.
+    #[allow(non_snake_case)]
+    pub fn rectified(rig: &RectifiedRig, T_world_left: &Se3, shift: f64) -> View<'static> {
+        View {
+            width: rig.width,
+            height: rig.height,
+            origin: T_world_left * Point3::new(shift, 0.0, 0.0),
+            R_world_cam: T_world_left.rotation,
+            focal: [rig.fx, rig.fy],
+            lens: Lens::Pinhole {
+                cx: rig.cx,
+                cy: rig.cy,
+            },
+        }
+    }
+
+    /// The camera of an unrectified rig at a pose.
+    #[allow(non_snake_case)]
+    pub fn bent(size: (usize, usize), camera: &'a Camera, T_world_cam: &Se3) -> Self {
+        Self {
+            width: size.0,
+            height: size.1,
+            origin: T_world_cam * Point3::origin(),
+            R_world_cam: T_world_cam.rotation,
+            focal: [camera.fx, camera.fy],
+            lens: Lens::Bent(camera),
+        }
+    }
+
+    /// The ray through a pixel, in the world.
+    pub fn ray(&self, u: f64, v: f64) -> Vector3<f64> {
+        let [fx, fy] = self.focal;
+        self.R_world_cam
+            * match self.lens {
+                Lens::Pinhole { cx, cy } => Vector3::new((u - cx) / fx, (v - cy) / fy, 1.0),
+                Lens::Bent(camera) => camera.ray(Vector2::new(u, v)).push(1.0),
+            }
+    }
+
+    /// Where a direction of the world appears; `None` behind the camera.
+    pub fn pixel(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
+        let d = self.R_world_cam.inverse() * direction;
+        match self.lens {
+            Lens::Pinhole { cx, cy } => (d.z > 0.0).then(|| {
+                Vector2::new(
+                    self.focal[0] * d.x / d.z + cx,
+                    self.focal[1] * d.y / d.z + cy,
+                )
+            }),
+            Lens::Bent(camera) => camera.project(&Point3::from(d)),
+        }
+    }
+
+    fn look(&self, u: f64, v: f64, pixels: f64) -> Look {
+        let step = |axis: Vector3<f64>, focal: f64| self.R_world_cam * (axis * (pixels / focal));
+        Look {
+            origin: self.origin,
+            ray: self.ray(u, v),
+            steps: [
+                step(Vector3::x(), self.focal[0]),
+                step(Vector3::y(), self.focal[1]),
+            ],
+        }
+    }
+}
+
+/// What each pixel's middle meets, row by row.
+pub(super) fn hits(scene: &impl Scene, view: &View) -> Vec<Option<Hit>> {
+    let mut hits = vec![None; view.width * view.height];
+    hits.par_chunks_exact_mut(view.width)
+        .enumerate()
+        .for_each(|(v, row)| {
+            for (u, hit) in row.iter_mut().enumerate() {
+                *hit = scene.hit(&view.origin, &view.ray(u as f64, v as f64));
+            }
+        });
+    hits
+}
+
+/// The light that falls on each pixel: linear red, green and blue, row by row.
+///
+/// Surfaces average their own light over a pixel; where a pixel lies on the outline of something,
+/// four rays share it.
+pub(super) fn render(scene: &impl Scene, view: &View) -> Vec<f32> {
+    const SHARED: [(f64, f64); 4] = [
+        (-0.125, -0.375),
+        (0.375, -0.125),
+        (0.125, 0.375),
+        (-0.375, 0.125),
+    ];
+    /// Pixels that a pixel's light comes from, across: lenses are a little less sharp than sensors.
+    const SPREAD: f64 = 1.3;
+    let (w, h) = (view.width, view.height);
+    let hits = hits(scene, view);
+    let mut image = vec![0.0f32; 3 * w * h];
+    image
+        .par_chunks_exact_mut(3 * w)
+        .enumerate()
+        .for_each(|(v, row)| {
+            for (u, pixel) in row.chunks_exact_mut(3).enumerate() {
+                let hit = &hits[v * w + u];
+                let neighbours = [
+                    (u > 0).then(|| &hits[v * w + u - 1]),
+                    (u + 1 < w).then(|| &hits[v * w + u + 1]),
+                    (v > 0).then(|| &hits[(v - 1) * w + u]),
+                    (v + 1 < h).then(|| &hits[(v + 1) * w + u]),
+                ];
+                let on_outline = neighbours.iter().flatten().any(|n| apart(hit, n));
+                let at = (u as f64, v as f64);
+                let light = if on_outline {
+                    let shared = |(du, dv): &(f64, f64)| {
+                        let look = view.look(at.0 + du, at.1 + dv, 0.5 * SPREAD);
+                        scene.light(&look, scene.hit(&look.origin, &look.ray).as_ref())
+                    };
+                    SHARED.iter().map(shared).sum::<Vector3<f32>>() / 4.0
+                } else {
+                    scene.light(&view.look(at.0, at.1, SPREAD), hit.as_ref())
+                };
+                pixel.copy_from_slice(light.as_slice());
+            }
+        });
+    image
+}
+
+/// Whether an outline lies between two neighbouring pixels.
+fn apart(a: &Option<Hit>, b: &Option<Hit>) -> bool {
+    match (a, b) {
+        (None, None) => false,
+        (Some(a), Some(b)) => {
+            let (near, far) = if a.t < b.t { (a.t, b.t) } else { (b.t, a.t) };
+            a.body.map(|body| body.0) != b.body.map(|body| body.0) || far > 1.15 * near
+        }
+        _ => true,
+    }
+}
