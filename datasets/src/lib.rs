@@ -30,5 +30,5 @@ pub use open::{FORMATS, open};
 pub use prefetch::{Prefetch, prefetch};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
-pub use synth::Synth;
-pub use write_folder::write_folder;
+pub use synth::{RandomScenes, Synth};
+pub use write_folder::{write_folder, write_synth};

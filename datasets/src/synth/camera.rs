@@ -80,7 +80,12 @@ impl Sensor {
         let options = &self.options;
         let (w, h) = (self.width, self.height);
         let veil = (options.bloom > 0.0).then(|| self.veil(image, shot));
-        let gain = shot.exposure * if shot.right { 1.0 + options.gain as f32 } else { 1.0 };
+        let gain = shot.exposure
+            * if shot.right {
+                1.0 + options.gain as f32
+            } else {
+                1.0
+            };
         let dust = &self.dust[usize::from(shot.right)];
         let corner = (w as f32).hypot(h as f32) / 2.0;
 
@@ -194,17 +199,18 @@ fn specks(count: usize, width: usize, height: usize, rng: &mut ChaCha8Rng) -> Ve
 fn blurred_rows(image: &[f32], width: usize, reach: usize) -> Vec<f32> {
     let mut out = vec![0.0; image.len()];
     let rows = out.par_chunks_exact_mut(3 * width);
-    rows.zip(image.par_chunks_exact(3 * width)).for_each(|(out, row)| {
-        for c in 0..3 {
-            let at = |x: isize| row[3 * x.clamp(0, width as isize - 1) as usize + c];
-            let reach = reach as isize;
-            let mut sum: f32 = (-reach..=reach).map(at).sum();
-            for x in 0..width as isize {
-                out[3 * x as usize + c] = sum / (2 * reach + 1) as f32;
-                sum += at(x + reach + 1) - at(x - reach);
+    rows.zip(image.par_chunks_exact(3 * width))
+        .for_each(|(out, row)| {
+            for c in 0..3 {
+                let at = |x: isize| row[3 * x.clamp(0, width as isize - 1) as usize + c];
+                let reach = reach as isize;
+                let mut sum: f32 = (-reach..=reach).map(at).sum();
+                for x in 0..width as isize {
+                    out[3 * x as usize + c] = sum / (2 * reach + 1) as f32;
+                    sum += at(x + reach + 1) - at(x - reach);
+                }
             }
-        }
-    });
+        });
     out
 }
 
@@ -245,8 +251,17 @@ mod tests {
     #[test]
     fn the_response_is_srgb_and_full_scale_is_white() {
         let plain = sensor(|_| ());
-        for (light, grey) in [(0.0, 0.0), (0.214, 0.5), (0.5, 0.7354), (1.0, 1.0), (3.0, 1.0)] {
-            assert!((shot(&plain, light, false, 0)[99] - grey).abs() < 2e-3, "{light}");
+        for (light, grey) in [
+            (0.0, 0.0),
+            (0.214, 0.5),
+            (0.5, 0.7354),
+            (1.0, 1.0),
+            (3.0, 1.0),
+        ] {
+            assert!(
+                (shot(&plain, light, false, 0)[99] - grey).abs() < 2e-3,
+                "{light}"
+            );
         }
     }
 

@@ -149,9 +149,8 @@ impl Dem {
             k if k == n => n - 2,
             _ => n - 1,
         };
-        let node = |k: usize| {
-            grid[mirrored(k / side, height) * width + mirrored(k % side, width)] as f32
-        };
+        let node =
+            |k: usize| grid[mirrored(k / side, height) * width + mirrored(k % side, width)] as f32;
         Surface::new(
             side,
             self.cell,
@@ -226,9 +225,8 @@ fn fill(width: usize, mut grid: Vec<Option<f64>>) -> Option<Vec<f64>> {
             (i.saturating_sub(1)..(i + 2).min(width)).map(move |i| j * width + i)
         })
     };
-    let is_edge = |grid: &[Option<f64>], k: usize| {
-        grid[k].is_none() && around(k).any(|n| grid[n].is_some())
-    };
+    let is_edge =
+        |grid: &[Option<f64>], k: usize| grid[k].is_none() && around(k).any(|n| grid[n].is_some());
     let mut ring: Vec<usize> = (0..grid.len()).filter(|k| is_edge(&grid, *k)).collect();
     while !ring.is_empty() {
         let mean = |k: usize| {
@@ -293,8 +291,11 @@ mod tests {
             .unwrap();
         let tags = image.encoder();
         tags.write_tag(Tag::ModelPixelScaleTag, scale).unwrap();
-        tags.write_tag(Tag::ModelTiepointTag, &[0.0, 0.0, 0.0, 5000.0, 9000.0, 0.0][..])
-            .unwrap();
+        tags.write_tag(
+            Tag::ModelTiepointTag,
+            &[0.0, 0.0, 0.0, 5000.0, 9000.0, 0.0][..],
+        )
+        .unwrap();
         tags.write_tag(Tag::GdalNodata, "-9999").unwrap();
         image.write_data(heights).unwrap();
     }
@@ -311,7 +312,13 @@ mod tests {
             let mut heights: Vec<f32> = (0..width * height).map(wavy).collect();
             heights[3 * width + 5] = -9999.0;
             heights[3 * width + 6] = f32::NAN;
-            write(&path, width as u32, height as u32, &heights, &[0.5, 0.5, 0.0]);
+            write(
+                &path,
+                width as u32,
+                height as u32,
+                &heights,
+                &[0.5, 0.5, 0.0],
+            );
             let surface = Dem::read(&path).unwrap().surface();
             for (k, h) in heights.iter().enumerate() {
                 // Corner of the first cell at (5000, 9000), rows to the south.
@@ -332,7 +339,11 @@ mod tests {
     fn files_that_are_no_ground_are_named_with_the_cure() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("dem.tif");
-        let message = |path: &Path| Dem::read(path).err().map_or(String::new(), |e| e.to_string());
+        let message = |path: &Path| {
+            Dem::read(path)
+                .err()
+                .map_or(String::new(), |e| e.to_string())
+        };
         assert!(message(&path).contains("dem.tif"));
         std::fs::write(&path, "II*\0nonsense").unwrap();
         assert!(message(&path).contains("GeoTIFF"), "{}", message(&path));

@@ -73,7 +73,11 @@ impl Light {
         };
         let skew: f64 = rng.random_range(-0.8..0.8);
         let drawn: f64 = rng.random_range(0.5..0.75);
-        let lamps = if options.look == Look::Arena { 0.4 } else { 0.0 };
+        let lamps = if options.look == Look::Arena {
+            0.4
+        } else {
+            0.0
+        };
         let [azimuth, elevation] = options
             .sun
             .unwrap_or([f64::atan2(-1.0, -skew), drawn + lamps]);
@@ -176,7 +180,7 @@ fn reflectance(cos_incidence: f32, cos_emission: f32, cos_phase: f32) -> f32 {
     const SURGE: f32 = 0.8;
     const WIDTH: f32 = 0.06;
     /// Makes the unit, see above (incidence and emission at 50 degrees).
-    const UNIT: f32 = 1.265;
+    const UNIT: f32 = 1.205;
     if cos_incidence <= 0.0 {
         return 0.0;
     }
@@ -227,7 +231,11 @@ pub(super) fn shadows(surface: &Surface, rocks: &Rocks, to_sun: &Vector3<f64>) -
     let index = |line: usize, k: usize| {
         // Light travels away from the sun.
         let line = if main < 0.0 { line } else { side - 1 - line };
-        if along_y { line * side + k } else { k * side + line }
+        if along_y {
+            line * side + k
+        } else {
+            k * side + line
+        }
     };
     let (whole, share) = (skew.floor(), skew - skew.floor());
     let repeats = surface.extent.is_none();
@@ -241,9 +249,8 @@ pub(super) fn shadows(surface: &Surface, rocks: &Rocks, to_sun: &Vector3<f64>) -
     // The second round starts with the shadows that the first left at the border.
     let rounds = if repeats { 2 } else { 1 };
     for line in (0..rounds).flat_map(|_| 0..side) {
-        let at = |shadow: &[f32], by: i32, k: usize| {
-            before(k, by).map_or(f32::MIN / 2.0, |k| shadow[k])
-        };
+        let at =
+            |shadow: &[f32], by: i32, k: usize| before(k, by).map_or(f32::MIN / 2.0, |k| shadow[k]);
         let next: Vec<f32> = (0..side)
             .map(|k| {
                 let carried = at(&shadow, whole as i32, k) * (1.0 - share)
@@ -302,7 +309,10 @@ mod tests {
                 agree += u32::from(dark == (edge > 0.0));
             }
             let share = f64::from(agree) / f64::from(asked);
-            assert!(asked > 1500 && share > 0.96, "{azimuth}: {agree} of {asked}");
+            assert!(
+                asked > 1500 && share > 0.96,
+                "{azimuth}: {agree} of {asked}"
+            );
         }
     }
 }

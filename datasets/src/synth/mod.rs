@@ -16,9 +16,13 @@ mod relief;
 mod render;
 mod rocks;
 mod rover;
+mod scenes;
+mod sensors;
 mod skin;
 mod surface;
 mod texture;
+
+use std::sync::OnceLock;
 
 use barchan_geometry::{Rectification, RectifiedRig, Rig, Se3, StampedPose, Trajectory};
 use nalgebra::{Point3, Vector3};
@@ -28,7 +32,7 @@ use rayon::prelude::*;
 
 use crate::folder::no_frame;
 use crate::resample::remap;
-use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource};
+use crate::{DataError, Plane, Rgb, Sensors, StereoFrame, StereoSource};
 use camera::{Sensor, Shot};
 use light::Light;
 use options::Options;
@@ -40,11 +44,14 @@ use surface::{Hit, Surface};
 
 pub use options::OPTIONS;
 pub use rocks::Rock;
+pub use scenes::RandomScenes;
 
 /// Seconds between frames.
 const INTERVAL: f64 = 0.2;
 /// Nearest and farthest depth of anything seen, metres; beyond lies the haze.
 const NEAR: f64 = 0.05;
+/// Sensor streams of longer sequences would not fit into memory.
+const MOST_WITH_SENSORS: usize = 100_000;
 /// Renders that share the time of an exposure.
 const BLUR_STEPS: usize = 6;
 
@@ -58,6 +65,8 @@ pub struct Synth {
     site: Site,
     sensor: Sensor,
     trajectory: Trajectory,
+    /// Made when first asked for.
+    sensors: OnceLock<Sensors>,
 }
 
 /// The ground, what stands on it and the light: all that can be seen.
@@ -80,7 +89,9 @@ impl Scene for Site {
         };
         let point = look.origin + look.ray * hit.t;
         let light = match hit.body {
-            None => self.skin.ground(&self.surface, &self.light, look, hit.t, &point),
+            None => self
+                .skin
+                .ground(&self.surface, &self.light, look, hit.t, &point),
             Some((id, face)) => {
                 let centre = self.rocks.centre_near(id, &point);
                 let rock = &self.rocks.list[id as usize];
@@ -94,7 +105,8 @@ impl Scene for Site {
                         .is_none())
                 .into();
                 let local = point - centre;
-                self.skin.rock(rock, face, &local, sunlit, &self.light, look, hit.t)
+                self.skin
+                    .rock(rock, face, &local, sunlit, &self.light, look, hit.t)
             }
         };
         self.light.through_haze(light, hit.t)
@@ -150,6 +162,7 @@ impl Synth {
                 skin,
             },
             trajectory,
+            sensors: OnceLock::new(),
             options,
         })
     }
@@ -174,6 +187,22 @@ impl Synth {
     /// The rig that images are taken with before rectification, for `rectified=false`.
     pub fn unrectified_rig(&self) -> Option<&Rig> {
         self.crooked.as_ref().map(|(rig, _)| rig)
+    }
+
+    /// The time of a frame, seconds.
+    pub(crate) fn time(&self, index: usize) -> f64 {
+        index as f64 * INTERVAL
+    }
+
+    /// The poses of the left camera that takes the images of [`Synth::photograph`].
+    pub(crate) fn trajectory_of_images(&self) -> Trajectory {
+        let mut trajectory = self.trajectory.clone();
+        if let Some((_, rectification)) = &self.crooked {
+            for pose in &mut trajectory.poses {
+                pose.T_world_cam *= rectification.R_rect_left;
+            }
+        }
+        trajectory
     }
 
     /// True depth of the left image of frame `index`, metres along the optical axis; NaN where
@@ -215,9 +244,8 @@ impl Synth {
         let view = self.view(&self.pose(index)?, right);
         let (w, h) = (self.rig.width, self.rig.height);
         let hits = render::hits(&self.site, &view);
-        let of = |(k, hit): (usize, &Option<Hit>)| {
-            value((k % w) as f64, (k / w) as f64, hit.as_ref())
-        };
+        let of =
+            |(k, hit): (usize, &Option<Hit>)| value((k % w) as f64, (k / w) as f64, hit.as_ref());
         let values = hits.par_iter().enumerate().map(of).collect();
         // One value a pixel by construction.
         Ok(Plane::from_raw(w as u32, h as u32, values).unwrap_or_default())
@@ -225,7 +253,9 @@ impl Synth {
 
     fn pose(&self, index: usize) -> Result<Se3, DataError> {
         let poses = &self.trajectory.poses;
-        let pose = poses.get(index).ok_or_else(|| no_frame(index, poses.len()))?;
+        let pose = poses
+            .get(index)
+            .ok_or_else(|| no_frame(index, poses.len()))?;
         Ok(pose.T_world_cam)
     }
 
@@ -234,8 +264,12 @@ impl Synth {
         View::rectified(&self.rig, T_world_cam, shift)
     }
 
-    /// Both images as the cameras take them: rectified, or not where the rig is crooked.
-    fn photograph(&self, index: usize) -> Result<[Rgb; 2], DataError> {
+    /// The left and right images of frame `index` as the cameras take them: of
+    /// [`Synth::unrectified_rig`] where there is one, else rectified.
+    ///
+    /// # Errors
+    /// When there is no such frame.
+    pub fn photograph(&self, index: usize) -> Result<[Rgb; 2], DataError> {
         self.pose(index)?;
         let [(left, sun_left), (right, sun_right)] = [false, true].map(|r| self.expose(index, r));
         let exposure = self.sensor.meter(&left);
@@ -267,9 +301,10 @@ impl Synth {
             let T_world_rect = self.plan.T_world_cam(&self.site.surface, time);
             let light = match &self.crooked {
                 None => render::render(&self.site, &self.view(&T_world_rect, right)),
-                Some(crooked) => {
-                    render::render(&self.site, &self.crooked_view(crooked, &T_world_rect, right))
-                }
+                Some(crooked) => render::render(
+                    &self.site,
+                    &self.crooked_view(crooked, &T_world_rect, right),
+                ),
             };
             if sum.is_empty() {
                 sum = light;
@@ -279,7 +314,9 @@ impl Synth {
         }
         sum.iter_mut().for_each(|l| *l /= steps as f32);
         let T_world_cam = self.trajectory.poses[index].T_world_cam;
-        let sun = self.view(&T_world_cam, right).pixel(&self.site.light.to_sun);
+        let sun = self
+            .view(&T_world_cam, right)
+            .pixel(&self.site.light.to_sun);
         (sum, sun)
     }
 
@@ -294,8 +331,18 @@ impl Synth {
         } else {
             (&rig.left, rectification.R_rect_left, 0.0)
         };
-        let T_world_cam = T_world_rect * Se3::translation(shift, 0.0, 0.0) * R_rect_cam;
-        View::bent((self.rig.width, self.rig.height), camera, &T_world_cam)
+        View::bent(&self.rig, T_world_rect, shift, camera, &R_rect_cam)
+    }
+}
+
+/// Opens what follows `synth:`, a traverse or `scenes,...`.
+///
+/// # Errors
+/// As [`Synth::parse`] and [`RandomScenes::parse`].
+pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
+    match spec.split_once(',').unwrap_or((spec, "")) {
+        ("scenes", rest) => Ok(Box::new(RandomScenes::parse(rest)?)),
+        _ => Ok(Box::new(Synth::parse(spec)?)),
     }
 }
 
@@ -354,6 +401,23 @@ impl StereoSource for Synth {
 
     fn true_trajectory(&self) -> Option<&Trajectory> {
         Some(&self.trajectory)
+    }
+
+    /// IMU at 100 Hz, wheel odometry at 10 Hz and GNSS at 1 Hz; of sequences up to 100,000 frames.
+    fn sensors(&self) -> Option<&Sensors> {
+        let frames = self.options.frames;
+        let noise_seed = self.options.seed ^ 0x1305;
+        (frames <= MOST_WITH_SENSORS).then(|| {
+            self.sensors.get_or_init(|| {
+                sensors::measure(
+                    &self.plan,
+                    &self.site.surface,
+                    (frames - 1) as f64 * INTERVAL,
+                    self.rig.baseline,
+                    self.options.sensor_noise.then_some(noise_seed),
+                )
+            })
+        })
     }
 }
 

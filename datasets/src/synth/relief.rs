@@ -32,12 +32,9 @@ pub(super) fn build(options: &Options, plan: &Plan) -> (Surface, Rocks) {
     }
     let surface = Surface::new(SIDE, CELL, Point3::origin(), None, control);
     let clear = Clear::new(plan, length, surface.period());
-    let list = scatter(
-        &surface,
-        options.rocks.unwrap_or(0.05),
-        &mut rng,
-        |place| if clear.at(place) { PEBBLE } else { f64::MAX },
-    );
+    let list = scatter(&surface, options.rocks.unwrap_or(0.05), &mut rng, |place| {
+        if clear.at(place) { PEBBLE } else { f64::MAX }
+    });
     let rocks = Rocks::new(&surface, list);
     (surface, rocks)
 }
@@ -191,7 +188,11 @@ fn blow_ripples(control: &mut [f32], amount: f32, rng: &mut ChaCha8Rng) {
                 let turns = (kx * i as f32 + ky * j as f32) / SIDE as f32 + bend[i];
                 let phase = turns - turns.floor();
                 // Seven tenths of the wave rise, the rest falls.
-                let rise = if phase < 0.7 { phase / 0.7 } else { (1.0 - phase) / 0.3 };
+                let rise = if phase < 0.7 {
+                    phase / 0.7
+                } else {
+                    (1.0 - phase) / 0.3
+                };
                 let smooth = rise * rise * (3.0 - 2.0 * rise);
                 *h += HEIGHT * amount * patch[i].clamp(0.0, 1.0) * (smooth - 0.5);
             }
@@ -205,7 +206,10 @@ fn press_tracks(control: &mut [f32], plan: &Plan, length: f64, rng: &mut ChaCha8
     /// From the middle of the rover to the middle of a wheel, and half a wheel's width, metres.
     const WHEEL: (f64, f64) = (0.35, 0.075);
     const CLEAT: f64 = 0.065;
-    let (phase, depth) = (rng.random_range(0.0..6.28), rng.random_range(0.008..0.02f32));
+    let (phase, depth) = (
+        rng.random_range(0.0..6.28),
+        rng.random_range(0.008..0.02f32),
+    );
     // A node belongs to the nearest sample of a rut and is pressed once.
     let mut pressed: Vec<(u32, f32, f32)> = Vec::new();
     for k in 0..(length / STEP) as usize {

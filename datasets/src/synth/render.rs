@@ -1,5 +1,5 @@
 use barchan_geometry::{Camera, RectifiedRig, Se3};
-use nalgebra::{Point3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
 use rayon::prelude::*;
 
 use super::surface::Hit;
@@ -18,6 +18,9 @@ pub(super) trait Scene: Sync {
 pub(super) struct Look {
     pub origin: Point3<f64>,
     pub ray: Vector3<f64>,
+    /// From where surfaces are judged that look different from different sides: the middle between
+    /// the cameras, so that both see them alike and the truth of the pair is exact.
+    pub eye: Point3<f64>,
     /// How the ray changes across the pixel along columns and rows (Igehy 1999).
     pub steps: [Vector3<f64>; 2],
 }
@@ -28,8 +31,10 @@ pub(super) struct View<'a> {
     pub width: usize,
     pub height: usize,
     pub origin: Point3<f64>,
+    /// See [`Look::eye`].
+    eye: Point3<f64>,
     /// Turns directions of the camera that `lens` belongs to into the world.
-    R_world_cam: UnitQuaternion<f64>,
+    R_world_cam: Matrix3<f64>,
     focal: [f64; 2],
     lens: Lens<'a>,
 }
@@ -48,7 +53,8 @@ impl<'a> View<'a> {
             width: rig.width,
             height: rig.height,
             origin: T_world_left * Point3::new(shift, 0.0, 0.0),
-            R_world_cam: T_world_left.rotation,
+            eye: middle(rig, T_world_left),
+            R_world_cam: T_world_left.rotation.to_rotation_matrix().into_inner(),
             focal: [rig.fx, rig.fy],
             lens: Lens::Pinhole {
                 cx: rig.cx,
@@ -57,14 +63,24 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The camera of an unrectified rig at a pose.
+    /// One camera of an unrectified rig: `straight` is the rig after rectification, and
+    /// `R_rect_cam` turns points of the camera into its rectified frame.
     #[allow(non_snake_case)]
-    pub fn bent(size: (usize, usize), camera: &'a Camera, T_world_cam: &Se3) -> Self {
+    pub fn bent(
+        straight: &RectifiedRig,
+        T_world_left: &Se3,
+        shift: f64,
+        camera: &'a Camera,
+        R_rect_cam: &UnitQuaternion<f64>,
+    ) -> Self {
         Self {
-            width: size.0,
-            height: size.1,
-            origin: T_world_cam * Point3::origin(),
-            R_world_cam: T_world_cam.rotation,
+            width: straight.width,
+            height: straight.height,
+            origin: T_world_left * Point3::new(shift, 0.0, 0.0),
+            eye: middle(straight, T_world_left),
+            R_world_cam: (T_world_left.rotation * R_rect_cam)
+                .to_rotation_matrix()
+                .into_inner(),
             focal: [camera.fx, camera.fy],
             lens: Lens::Bent(camera),
         }
@@ -82,7 +98,7 @@ impl<'a> View<'a> {
 
     /// Where a direction of the world appears; `None` behind the camera.
     pub fn pixel(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
-        let d = self.R_world_cam.inverse() * direction;
+        let d = self.R_world_cam.tr_mul(direction);
         match self.lens {
             Lens::Pinhole { cx, cy } => (d.z > 0.0).then(|| {
                 Vector2::new(
@@ -95,16 +111,20 @@ impl<'a> View<'a> {
     }
 
     fn look(&self, u: f64, v: f64, pixels: f64) -> Look {
-        let step = |axis: Vector3<f64>, focal: f64| self.R_world_cam * (axis * (pixels / focal));
+        let step = |axis: usize| self.R_world_cam.column(axis) * (pixels / self.focal[axis]);
         Look {
             origin: self.origin,
             ray: self.ray(u, v),
-            steps: [
-                step(Vector3::x(), self.focal[0]),
-                step(Vector3::y(), self.focal[1]),
-            ],
+            eye: self.eye,
+            steps: [step(0), step(1)],
         }
     }
+}
+
+/// The middle between the cameras of a rig.
+#[allow(non_snake_case)]
+fn middle(rig: &RectifiedRig, T_world_left: &Se3) -> Point3<f64> {
+    T_world_left * Point3::new(rig.baseline / 2.0, 0.0, 0.0)
 }
 
 /// What each pixel's middle meets, row by row.
@@ -132,7 +152,7 @@ pub(super) fn render(scene: &impl Scene, view: &View) -> Vec<f32> {
         (-0.375, 0.125),
     ];
     /// Pixels that a pixel's light comes from, across: lenses are a little less sharp than sensors.
-    const SPREAD: f64 = 1.3;
+    const SPREAD: f64 = 1.25;
     let (w, h) = (view.width, view.height);
     let hits = hits(scene, view);
     let mut image = vec![0.0f32; 3 * w * h];
@@ -171,7 +191,8 @@ fn apart(a: &Option<Hit>, b: &Option<Hit>) -> bool {
         (None, None) => false,
         (Some(a), Some(b)) => {
             let (near, far) = if a.t < b.t { (a.t, b.t) } else { (b.t, a.t) };
-            a.body.map(|body| body.0) != b.body.map(|body| body.0) || far > 1.15 * near
+            a.body.map(|body| body.0) != b.body.map(|body| body.0)
+                || far > 1.15 * near && near < 15.0
         }
         _ => true,
     }

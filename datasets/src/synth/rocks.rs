@@ -252,9 +252,7 @@ impl Rocks {
         for &id in self.over(surface, x, y) {
             let rock = &self.list[id as usize];
             let offset = self.nearest(Vector3::new(x, y, 0.0) - rock.centre.coords);
-            if let Some(height) =
-                rock.top_at(rock.centre.x + offset.x, rock.centre.y + offset.y)
-            {
+            if let Some(height) = rock.top_at(rock.centre.x + offset.x, rock.centre.y + offset.y) {
                 top = top.max(height);
             }
         }
@@ -301,7 +299,10 @@ pub(super) fn scatter(
     if share <= 0.0 {
         return Vec::new();
     }
-    let size = surface.extent.unwrap_or([surface.side; 2]).map(|n| n as f64 * surface.cell);
+    let size = surface
+        .extent
+        .unwrap_or([surface.side; 2])
+        .map(|n| n as f64 * surface.cell);
     let q = 1.79 + 0.152 / share;
     // Rocks a square metre larger than each of the diameters, from the largest down.
     let ratio = (DIAMETERS.0 / DIAMETERS.1).powf(1.0 / BINS as f64);
@@ -389,7 +390,10 @@ mod tests {
                 covered += u32::from(rocks.top(&surface, x, y) > 0.0);
             }
             let found = f64::from(covered) / 40_000.0;
-            assert!((0.8..1.15).contains(&(found / expected)), "{found} {expected}");
+            assert!(
+                (0.8..1.15).contains(&(found / expected)),
+                "{found} {expected}"
+            );
             let large = rocks.list.iter().filter(|r| r.radius > 0.2).count();
             assert!(rocks.list.len() > 20 * large.max(1));
         }

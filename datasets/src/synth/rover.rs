@@ -56,9 +56,7 @@ impl Plan {
             speed: options.speed,
             between_stops: options.stops.unwrap_or(if survey { 6.0 } else { 0.0 }),
             turns: survey,
-            pan: options
-                .pan
-                .unwrap_or(if survey { -TAU / 4.0 } else { 0.0 }),
+            pan: options.pan.unwrap_or(if survey { -TAU / 4.0 } else { 0.0 }),
             tilt: options.tilt,
             mast: options.mast,
             baseline: options.baseline,
@@ -108,9 +106,8 @@ impl Plan {
         let cycles = (time / (drive + stop)).floor();
         let t = time - cycles * (drive + stop);
         // The speed rises and falls as half a cosine wave.
-        let risen = |t: f64| {
-            self.speed * (t / 2.0 - ramp / TAU * (std::f64::consts::PI * t / ramp).sin())
-        };
+        let risen =
+            |t: f64| self.speed * (t / 2.0 - ramp / TAU * (std::f64::consts::PI * t / ramp).sin());
         let s = if t < ramp {
             risen(t)
         } else if t < drive - ramp {
@@ -244,10 +241,16 @@ mod tests {
         for route in ["circle", "loop", "survey", "straight"] {
             let plan = plan(&format!("route={route},seed=3"));
             for k in 0..6000 {
-                let (a, b) = (plan.place(k as f64 * 0.02), plan.place((k + 1) as f64 * 0.02));
+                let (a, b) = (
+                    plan.place(k as f64 * 0.02),
+                    plan.place((k + 1) as f64 * 0.02),
+                );
                 let step = (b - a).norm();
                 assert!((0.005..0.032).contains(&step), "{route} {k}: {step}");
-                assert!(route == "straight" || a.norm() <= Plan::REACH, "{route}: {a}");
+                assert!(
+                    route == "straight" || a.norm() <= Plan::REACH,
+                    "{route}: {a}"
+                );
                 let (x, y) = (plan.heading(k as f64 * 0.02), (b - a) / step);
                 assert!((x - y).norm() < 0.03, "{route} {k}: {x} {y}");
             }
@@ -269,7 +272,13 @@ mod tests {
         }
         assert!(stood > 3000 && drove > 3000, "{stood} {drove}");
 
-        let surface = Surface::new(64, 0.5, nalgebra::Point3::origin(), None, vec![0.0; 64 * 64]);
+        let surface = Surface::new(
+            64,
+            0.5,
+            nalgebra::Point3::origin(),
+            None,
+            vec![0.0; 64 * 64],
+        );
         let stop = 6.0 / 0.3 + RAMP;
         let ahead = |t: f64| plan.T_world_cam(&surface, t).rotation * Vector3::z();
         let quarter = ahead(stop + 12.0);

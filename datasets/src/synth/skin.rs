@@ -10,7 +10,7 @@ use super::options::Options;
 use super::render::Look;
 use super::rocks::{Rock, Rocks};
 use super::surface::Surface;
-use super::texture::{Footprint, Texture};
+use super::texture::{Footprint, Texture, wrapped};
 
 /// What the ground and the rocks look like: grain, gravel, patches, shadows.
 pub(super) struct Skin {
@@ -54,8 +54,7 @@ impl Skin {
         let over = Footprint::new(over[0], over[1]);
         let cell = surface.cell as f32;
         let (u, v) = surface.cells(point.x, point.y);
-        let period = surface.side as f64;
-        let node = Vector2::new(u.rem_euclid(period) as f32, v.rem_euclid(period) as f32);
+        let node = Vector2::new(u, v).map(|c| wrapped(c, surface.side as f64));
         let [slope_x, slope_y, shadow, gravel] = self.lie.mean(node, over.scaled(1.0 / cell));
 
         // Seen closely the surface's own normal, from afar the mean of the slopes in the pixel.
@@ -80,12 +79,14 @@ impl Skin {
         let mut tone = 1.0 + self.contrast * (0.22 * fine + 0.16 * coarse);
         let share = light.gravel * gravel;
         if share > 0.02 {
-            let [stones] = self.gravel.mean(texel(place, GRAVEL), over.scaled(1.0 / GRAVEL));
+            let [stones] = self
+                .gravel
+                .mean(texel(place, GRAVEL), over.scaled(1.0 / GRAVEL));
             tone += share * stones;
         }
         // Contrast as the eye has it: the square undoes most of the camera's response curve.
         let albedo = light.sand * tone.max(0.1).powi(2);
-        light.reflected(&albedo, &normal, sunlit, &to_eye(look))
+        light.reflected(&albedo, &normal, sunlit, &to_eye(look, point))
     }
 
     /// Light from a rock: `local` is counted from its middle.
@@ -111,7 +112,9 @@ impl Skin {
         let place = flatten(local) + own;
         let [fine] = self.grain.mean(texel(place, FINE), over.scaled(1.0 / FINE));
         let metres = 3.1 * FINE;
-        let [coarse] = self.grain.mean(texel(place, metres), over.scaled(1.0 / metres));
+        let [coarse] = self
+            .grain
+            .mean(texel(place, metres), over.scaled(1.0 / metres));
 
         // Edges are worn: towards a neighbouring face the normal turns to it.
         let worn = (0.07 * rock.radius) as f32;
@@ -124,18 +127,19 @@ impl Skin {
         let tilt = Vector3::new(fine, coarse, fine - coarse) * 0.06;
         let normal = (normal.normalize() + tilt).normalize();
         let tone = rock.brightness as f32 * (1.0 + 0.16 * fine + 0.22 * coarse).max(0.1);
-        light.reflected(&(light.stone * tone * tone), &normal, sunlit, &to_eye(look))
+        let to_eye = to_eye(look, &(look.origin + look.ray * depth));
+        light.reflected(&(light.stone * tone * tone), &normal, sunlit, &to_eye)
     }
 }
 
 /// Positions in a grain texture wrap: they are reduced in f64 first, or far from the origin they blur.
 fn texel(place: Vector2<f64>, metres: f32) -> Vector2<f32> {
-    let wrapped = |v: f64| (v / f64::from(metres)).rem_euclid(GRAIN as f64) as f32;
-    Vector2::new(wrapped(place.x), wrapped(place.y))
+    let side = GRAIN as f64;
+    place.map(|v| wrapped(v / f64::from(metres), side))
 }
 
-fn to_eye(look: &Look) -> Vector3<f32> {
-    -look.ray.normalize().cast::<f32>()
+fn to_eye(look: &Look, point: &Point3<f64>) -> Vector3<f32> {
+    (look.eye - point).normalize().cast::<f32>()
 }
 
 /// What a pixel covers of a face with a normal: the steps along it to the pixel's ends (ray
@@ -151,15 +155,12 @@ fn lie(surface: &Surface, rocks: &Rocks, light: &Light, seed: u32) -> Texture<4>
     let side = surface.side;
     let shadow = shadows(surface, rocks, &light.to_sun);
     let mut cover = vec![0.5; side * side];
-    cover
-        .par_chunks_mut(side)
-        .enumerate()
-        .for_each(|(j, row)| {
-            for (waves, amplitude) in [(7, 2.0), (23, 1.5), (61, 1.0)] {
-                let waves = waves.min(side as u32 / 4).max(1);
-                add_noise(row, j, waves, amplitude, seed.wrapping_add(400 + waves));
-            }
-        });
+    cover.par_chunks_mut(side).enumerate().for_each(|(j, row)| {
+        for (waves, amplitude) in [(7, 2.0), (23, 1.5), (61, 1.0)] {
+            let waves = waves.min(side as u32 / 4).max(1);
+            add_noise(row, j, waves, amplitude, seed.wrapping_add(400 + waves));
+        }
+    });
     let control = &surface.control;
     let at = |k: usize| {
         let (i, j) = ((k % side) as i32, (k / side) as i32);
@@ -213,7 +214,10 @@ fn grain(seed: u32, along: Vector2<f32>) -> Texture<1> {
         seed.wrapping_add(300),
     );
     let value = |k: usize| [patches[k] + 0.45 * lit(&relief, k, along)];
-    Texture::new(GRAIN, (0..GRAIN * GRAIN).into_par_iter().map(value).collect())
+    Texture::new(
+        GRAIN,
+        (0..GRAIN * GRAIN).into_par_iter().map(value).collect(),
+    )
 }
 
 /// Pebbles of 1 to 5 cm, each with its own brightness and a lit and a dark side, and their small
@@ -250,5 +254,10 @@ fn gravel(seed: u32, along: Vector2<f32>) -> Texture<1> {
         }
     }
     let mean = tone.iter().sum::<f32>() / tone.len() as f32;
-    Texture::new(GRAIN, tone.into_iter().map(|t| [(t - mean).clamp(-0.6, 1.0)]).collect())
+    Texture::new(
+        GRAIN,
+        tone.into_iter()
+            .map(|t| [(t - mean).clamp(-0.6, 1.0)])
+            .collect(),
+    )
 }

@@ -101,15 +101,18 @@ impl Surface {
         let control = &self.control;
         let third = |a: f32, b: f32, c: f32| (a + 4.0 * b + c) / 6.0;
         let mut heights = vec![0.0; side * side];
-        heights.par_chunks_mut(side).enumerate().for_each(|(j, row)| {
-            let j = j as i32;
-            let lines = [-1, 0, 1].map(|k| &control[self.wrap(j + k) * side..][..side]);
-            let column = |i: usize| third(lines[0][i], lines[1][i], lines[2][i]);
-            for (i, out) in row.iter_mut().enumerate() {
-                let [before, after] = [-1, 1].map(|k| column(self.wrap(i as i32 + k)));
-                *out = third(before, column(i), after);
-            }
-        });
+        heights
+            .par_chunks_mut(side)
+            .enumerate()
+            .for_each(|(j, row)| {
+                let j = j as i32;
+                let lines = [-1, 0, 1].map(|k| &control[self.wrap(j + k) * side..][..side]);
+                let column = |i: usize| third(lines[0][i], lines[1][i], lines[2][i]);
+                for (i, out) in row.iter_mut().enumerate() {
+                    let [before, after] = [-1, 1].map(|k| column(self.wrap(i as i32 + k)));
+                    *out = third(before, column(i), after);
+                }
+            });
         heights
     }
 
@@ -366,7 +369,11 @@ mod tests {
             let angle = k as f64 * 0.7;
             let down = -0.02 - 0.9 * (k as f64 / 400.0).powi(2);
             let (x, y) = (3.0 * angle.sin(), -4.0 * angle.cos());
-            let origin = Point3::new(x, y, surface.height(x, y).max(rocks.top(&surface, x, y)) + 0.8);
+            let origin = Point3::new(
+                x,
+                y,
+                surface.height(x, y).max(rocks.top(&surface, x, y)) + 0.8,
+            );
             let direction = Vector3::new(angle.cos(), angle.sin(), down);
             let Some(hit) = surface.hit(&rocks, &origin, &direction, 0.05, 40.0) else {
                 continue;

@@ -7,31 +7,41 @@ fn synth(spec: &str) -> Synth {
 }
 
 /// The mean difference, in grey levels, between the left image and the right one warped to it by
-/// the true disparity, over pixels that the right camera sees; and their share of all.
-fn warp_error(synth: &Synth, index: usize) -> (f64, f64) {
+/// the true disparity, over pixels that the right camera sees; without those on an outline, of which
+/// it sees a part only; and the share of all pixels that were compared.
+fn warp_error(synth: &Synth, index: usize) -> [f64; 3] {
     let frame = synth.frame(index).unwrap();
     let disparity = synth.true_disparity(index).unwrap().unwrap();
     let occlusion = synth.true_occlusion(index).unwrap();
     let (w, h) = disparity.dimensions();
-    let (mut error, mut seen) = (0.0, 0.0);
-    for (u, v) in (0..h).flat_map(|v| (0..w).map(move |u| (u, v))) {
-        let at = u as f32 - disparity[(u, v)].0[0];
+    let (mut all, mut whole) = ((0.0, 0.0), (0.0, 0.0));
+    for (u, v) in (1..h - 1).flat_map(|v| (1..w - 1).map(move |u| (u, v))) {
+        let d = disparity[(u, v)].0[0];
+        let at = u as f32 - d;
         // NaN compares false.
         if !(at >= 1.0) || occlusion[(u, v)].0[0] != 0.0 {
             continue;
         }
-        seen += 1.0;
         let weights = cubic_weights(at.fract());
+        let mut error = 0.0;
         for c in 0..3 {
             let right: f32 = (0..4u32)
                 .map(|k| {
                     weights[k as usize] * frame.right[((at as u32 + k - 1).min(w - 1), v)].0[c]
                 })
                 .sum();
-            error += f64::from((right - frame.left[(u, v)].0[c]).abs()) / 3.0;
+            error += f64::from((right - frame.left[(u, v)].0[c]).abs()) / 3.0 * 255.0;
+        }
+        all = (all.0 + error, all.1 + 1.0);
+        let around = [(u - 1, v), (u + 1, v), (u, v - 1), (u, v + 1)];
+        if around
+            .iter()
+            .all(|n| (disparity[*n].0[0] / d - 1.0).abs() < 0.1)
+        {
+            whole = (whole.0 + error, whole.1 + 1.0);
         }
     }
-    (error / seen * 255.0, seen / f64::from(w * h))
+    [all.0 / all.1, whole.0 / whole.1, all.1 / f64::from(w * h)]
 }
 
 #[test]
@@ -39,13 +49,19 @@ fn the_right_image_warped_by_the_true_disparity_is_the_left_image() {
     for spec in [
         "seed=1,frames=18",
         "seed=4,frames=18",
-        "seed=2,frames=18,look=moon,rocks=0.1",
-        "seed=3,frames=18,look=devon",
         "seed=3,frames=18,look=arena,texture=real",
+        "seed=2,frames=18,look=moon",
+        "seed=3,frames=18,look=devon",
     ] {
-        let (error, share) = warp_error(&synth(&format!("{spec},noise=0")), 17);
-        println!("{spec}: {error:.3} grey levels over {:.1} %", share * 100.0);
-        assert!(error < 9.0, "{spec}: mean error {error} grey levels");
+        let [error, inside, share] = warp_error(&synth(&format!("{spec},noise=0")), 17);
+        println!("{spec}: {error:.3}, without outlines {inside:.3} grey levels; {share:.3} seen");
+        // Black shadows of many stones are the hardest: there outlines take more.
+        let most = if spec.contains("moon") || spec.contains("devon") {
+            1.4
+        } else {
+            1.0
+        };
+        assert!(error < most && inside < 1.0, "{spec}: {error} {inside}");
         assert!(share > 0.6, "{spec}: {share}");
     }
 }
@@ -76,8 +92,14 @@ fn the_truths_of_both_views_agree_where_nothing_hides() {
         }
     }
     println!("{agree} of {seen} seen agree, {before} of {hidden} hidden lie behind");
-    assert!(f64::from(agree) > 0.98 * f64::from(seen), "{agree} of {seen}");
-    assert!(hidden > 300 && f64::from(before) > 0.98 * f64::from(hidden), "{before} of {hidden}");
+    assert!(
+        f64::from(agree) > 0.98 * f64::from(seen),
+        "{agree} of {seen}"
+    );
+    assert!(
+        hidden > 300 && f64::from(before) > 0.98 * f64::from(hidden),
+        "{before} of {hidden}"
+    );
 }
 
 #[test]
@@ -123,7 +145,10 @@ fn a_point_seen_from_above_is_at_the_ground_height() {
     for k in 0..2000 {
         let (x, y) = (k as f64 * 0.0137 - 14.0, (k as f64 * 0.731).sin() * 12.0);
         let from = Point3::new(x, y, 20.0);
-        let hit = site.surface.hit(&site.rocks, &from, &-Vector3::z(), 0.0, 40.0).unwrap();
+        let hit = site
+            .surface
+            .hit(&site.rocks, &from, &-Vector3::z(), 0.0, 40.0)
+            .unwrap();
         assert!((20.0 - hit.t - synth.ground_height(x, y)).abs() < 1e-5);
         on_rock += u32::from(synth.ground_height(x, y) > synth.bare_ground_height(x, y));
     }
@@ -157,7 +182,10 @@ fn a_seed_fixes_every_byte_and_another_changes_them() {
     let other = synth("seed=6,frames=9,width=64,height=48");
     // In another order, after other frames, on one thread.
     let first = a.frame(7).unwrap();
-    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let one = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
     let again = one.install(|| {
         b.frame(8).unwrap();
         b.frame(0).unwrap();
@@ -193,7 +221,7 @@ fn a_rectified_frame_of_a_crooked_rig_has_the_exact_truth() {
         }
     }
     println!("{} grey levels", error / seen);
-    assert!(seen > 20_000.0 && error / seen < 2.5, "{}", error / seen);
+    assert!(seen > 20_000.0 && error / seen < 2.0, "{}", error / seen);
 }
 
 #[test]

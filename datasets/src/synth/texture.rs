@@ -14,6 +14,15 @@ pub(super) fn spline(t: f32) -> [f32; 4] {
     ]
 }
 
+/// `v` less as many whole `period`s as fit. (`f64::rem_euclid` is a slow division of integers' kind,
+/// and this is asked millions of times a frame.)
+pub(super) fn wrapped(v: f64, period: f64) -> f32 {
+    let turns = v / period;
+    let whole = turns as i64;
+    let whole = whole - i64::from(whole as f64 > turns);
+    ((turns - whole as f64) * period) as f32
+}
+
 /// A square image of `C` channels that repeats, with its halvings, for look-ups band-limited to the
 /// area a pixel covers: what one camera sees of a point, the other sees too, and neither aliases.
 pub(super) struct Texture<const C: usize> {
