@@ -19,6 +19,8 @@ pub(super) struct Light {
     pub stone: Vector3<f32>,
     /// How much of the ground is gravel, 0 to 1.
     pub gravel: f32,
+    /// Contrast of the grain between the gravel, times the usual.
+    pub grain: f32,
     sky_low: Vector3<f32>,
     sky_high: Vector3<f32>,
     /// Distance at which haze has taken 1 - 1/e of the light, metres.
@@ -50,11 +52,11 @@ impl Light {
             ),
             // A hall: lamps from above and much light from the walls.
             Look::Arena => (
-                v(0.46, 0.42, 0.36),
-                v(0.16, 0.15, 0.15),
+                v(0.62, 0.24, 0.19),
+                v(0.28, 0.12, 0.10),
                 0.0,
-                v(0.75, 0.72, 0.66),
-                v(0.34, 0.33, 0.31),
+                v(0.95, 0.92, 0.86),
+                v(0.24, 0.23, 0.21),
                 Sky::Black,
             ),
             Look::Devon => (
@@ -96,7 +98,13 @@ impl Light {
             sky_low,
             sky_high,
             haze,
-            hills: std::array::from_fn(|_| rng.random_range(0.0..6.28)),
+            grain: match options.look {
+                Look::Mars => 1.0,
+                Look::Moon => 0.8,
+                Look::Arena => 0.35,
+                Look::Devon => 0.45,
+            },
+            hills: std::array::from_fn(|_| rng.random_range(0.0..std::f64::consts::TAU)),
         }
     }
 

@@ -212,7 +212,7 @@ impl Synth {
     /// When there is no such frame.
     pub fn true_depth(&self, index: usize) -> Result<Plane, DataError> {
         let depth = |hit: Option<&Hit>| hit.map_or(f32::NAN, |hit| hit.t as f32);
-        Ok(self.truth(index, false, |_, _, hit| depth(hit))?)
+        self.truth(index, false, |_, _, hit| depth(hit))
     }
 
     /// Where the right camera does not see what the left image of frame `index` shows: 1 there, 0

@@ -5,7 +5,7 @@ use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
 use super::noise::add_noise;
-use super::options::{Options, RouteKind};
+use super::options::{Look, Options, RouteKind};
 use super::rocks::{Rocks, scatter};
 use super::rover::Plan;
 use super::surface::Surface;
@@ -26,15 +26,25 @@ pub(super) fn build(options: &Options, plan: &Plan) -> (Surface, Rocks) {
     let length = (options.frames as f64 * 0.2 * options.speed + 8.0).min(LONGEST);
     let mut control = sand(rng.random(), options.route != RouteKind::Straight);
     dig_craters(&mut control, options.craters, &mut rng);
-    blow_ripples(&mut control, options.ripples as f32, &mut rng);
+    // The sandpit of the arena: more ripples, fewer stones.
+    let (windy, stony) = match options.look {
+        Look::Arena => (2.0, 0.015),
+        _ => (1.0, 0.05),
+    };
+    blow_ripples(&mut control, windy * options.ripples as f32, &mut rng);
     if options.tracks {
         press_tracks(&mut control, plan, length, &mut rng);
     }
     let surface = Surface::new(SIDE, CELL, Point3::origin(), None, control);
     let clear = Clear::new(plan, length, surface.period());
-    let list = scatter(&surface, options.rocks.unwrap_or(0.05), &mut rng, |place| {
-        if clear.at(place) { PEBBLE } else { f64::MAX }
-    });
+    let list = scatter(
+        &surface,
+        options.rocks.unwrap_or(stony),
+        &mut rng,
+        |place| {
+            if clear.at(place) { PEBBLE } else { f64::MAX }
+        },
+    );
     let rocks = Rocks::new(&surface, list);
     (surface, rocks)
 }
@@ -207,7 +217,7 @@ fn press_tracks(control: &mut [f32], plan: &Plan, length: f64, rng: &mut ChaCha8
     const WHEEL: (f64, f64) = (0.35, 0.075);
     const CLEAT: f64 = 0.065;
     let (phase, depth) = (
-        rng.random_range(0.0..6.28),
+        rng.random_range(0.0..std::f64::consts::TAU),
         rng.random_range(0.008..0.02f32),
     );
     // A node belongs to the nearest sample of a rut and is pressed once.

@@ -30,7 +30,7 @@ impl Rock {
             rng.random_range(-3.1..3.1),
         ));
         let count = rng.random_range(11..=16);
-        let twist: f64 = rng.random_range(0.0..6.28);
+        let twist: f64 = rng.random_range(0.0..std::f64::consts::TAU);
         let mut faces = Vec::with_capacity(count);
         for k in 0..count {
             // Points of a golden spiral cover the sphere evenly; jitter makes the faces unequal.

@@ -419,13 +419,7 @@ fn material(kind: usize, seed: u32) -> Texture<3> {
             *v += match pattern {
                 1 => 0.6 * wave(across),
                 2 => 0.6 * wave(stripes as f32 * x) * wave(stripes as f32 * y),
-                3 => {
-                    if *v > 0.45 {
-                        1.0
-                    } else {
-                        0.0
-                    }
-                }
+                3 => f32::from(u8::from(*v > 0.45)),
                 _ => 0.0,
             };
         }
@@ -436,7 +430,7 @@ fn material(kind: usize, seed: u32) -> Texture<3> {
         let share = (0.5 + 0.4 * v).clamp(0.0, 1.0);
         (dark * (1.0 - share) + bright * share).into()
     };
-    Texture::new(TEXELS, image.into_iter().map(painted).collect())
+    Texture::new(TEXELS, true, image.into_iter().map(painted).collect())
 }
 
 #[cfg(test)]
@@ -454,7 +448,7 @@ mod tests {
             let mut spread = Vec::new();
             for (u, v, d) in left.enumerate_pixels() {
                 let at = u as f32 - d.0[0];
-                if !(at >= 0.0) || at + 1.0 >= 255.0 {
+                if at.is_nan() || at < 0.0 || at + 1.0 >= 255.0 {
                     continue;
                 }
                 let (x, share) = (at as u32, at.fract());

@@ -76,13 +76,13 @@ impl Skin {
         };
         let at = texel(turn.cast::<f64>() * place, COARSE);
         let [coarse] = self.grain.mean(at, turned.scaled(1.0 / COARSE));
-        let mut tone = 1.0 + self.contrast * (0.22 * fine + 0.16 * coarse);
+        let mut tone = 1.0 + self.contrast * light.grain * (0.22 * fine + 0.16 * coarse);
         let share = light.gravel * gravel;
         if share > 0.02 {
             let [stones] = self
                 .gravel
                 .mean(texel(place, GRAVEL), over.scaled(1.0 / GRAVEL));
-            tone += share * stones;
+            tone += 1.5 * share * stones;
         }
         // Contrast as the eye has it: the square undoes most of the camera's response curve.
         let albedo = light.sand * tone.max(0.1).powi(2);
@@ -176,7 +176,11 @@ fn lie(surface: &Surface, rocks: &Rocks, light: &Light, seed: u32) -> Texture<4>
             cover[k].clamp(0.0, 1.0),
         ]
     };
-    Texture::new(side, (0..side * side).into_par_iter().map(at).collect())
+    Texture::new(
+        side,
+        false,
+        (0..side * side).into_par_iter().map(at).collect(),
+    )
 }
 
 /// A square of noise of the grain's side: octaves of waves and amplitude.
@@ -216,6 +220,7 @@ fn grain(seed: u32, along: Vector2<f32>) -> Texture<1> {
     let value = |k: usize| [patches[k] + 0.45 * lit(&relief, k, along)];
     Texture::new(
         GRAIN,
+        true,
         (0..GRAIN * GRAIN).into_par_iter().map(value).collect(),
     )
 }
@@ -256,6 +261,7 @@ fn gravel(seed: u32, along: Vector2<f32>) -> Texture<1> {
     let mean = tone.iter().sum::<f32>() / tone.len() as f32;
     Texture::new(
         GRAIN,
+        true,
         tone.into_iter()
             .map(|t| [(t - mean).clamp(-0.6, 1.0)])
             .collect(),

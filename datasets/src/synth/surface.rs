@@ -172,7 +172,7 @@ impl Surface {
         let (mut t, mut level) = (near, 4.min(top));
         while t < best.t {
             let p = ray.at(t);
-            if direction.z >= 0.0 && p.z > highest || !self.holds(p.x, p.y) {
+            if p.z > highest && direction.z >= 0.0 || !self.holds(p.x, p.y) {
                 break;
             }
             let (i, j) = (floor(p.x), floor(p.y));
@@ -184,7 +184,9 @@ impl Surface {
             let exit_x = ((f64::from((i + ahead.0) << level) - p.x) * slowness.0).abs();
             let exit_y = ((f64::from((j + ahead.1) << level) - p.y) * slowness.1).abs();
             // Upright rays leave a square nowhere, but they end.
-            let exit = exit_x.min(exit_y).min(best.t - t);
+            let exit = if exit_x < exit_y { exit_x } else { exit_y };
+            let left = best.t - t;
+            let exit = if exit < left { exit } else { left };
             let side = self.side >> level;
             let square = (j as usize & (side - 1)) * side + (i as usize & (side - 1));
             let mut bound = self.bounds[level][square];
@@ -323,20 +325,29 @@ fn floor(v: f64) -> i32 {
 /// Upper bounds over squares of 1, 2, 4, ... cells.
 fn bounds(side: usize, control: &[f32]) -> Vec<Vec<f32>> {
     let wrap = |index: i32| index as usize & (side - 1);
-    // A cell's surface lies in the hull of its 4 x 4 control points.
+    // A cell's surface lies in the hull of its Bezier points, which is tighter than that of its 4 x 4
+    // control points: along each axis they are the ends and two points between the middle two.
+    let bezier = |c: [f32; 4]| {
+        [
+            (c[0] + 4.0 * c[1] + c[2]) / 6.0,
+            (2.0 * c[1] + c[2]) / 3.0,
+            (c[1] + 2.0 * c[2]) / 3.0,
+            (c[1] + 4.0 * c[2] + c[3]) / 6.0,
+        ]
+    };
     let mut cells = vec![0.0; side * side];
     cells.par_chunks_mut(side).enumerate().for_each(|(j, row)| {
-        let column: Vec<f32> = (0..side)
-            .map(|i| {
-                (-1..3)
-                    .map(|b| control[wrap(j as i32 + b) * side + i])
-                    .fold(f32::MIN, f32::max)
-            })
-            .collect();
+        let lines = [-1, 0, 1, 2].map(|b| &control[wrap(j as i32 + b) * side..][..side]);
+        // The Bezier points across the rows for every column of control points.
+        let column = |i: i32| bezier(lines.map(|line| line[wrap(i)]));
+        let mut window = [column(-1), column(0), column(1), column(2)];
         for (i, out) in row.iter_mut().enumerate() {
-            *out = (-1..3)
-                .map(|a| column[wrap(i as i32 + a)])
-                .fold(f32::MIN, f32::max);
+            *out = (0..4)
+                .flat_map(|k| bezier(window.map(|column| column[k])))
+                .fold(f32::MIN, f32::max)
+                // Rounding must not put the surface above its bound.
+                + 1e-6;
+            window = [window[1], window[2], window[3], column(i as i32 + 3)];
         }
     });
     let mut levels = vec![cells];
