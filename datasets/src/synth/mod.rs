@@ -78,9 +78,15 @@ struct Site {
 }
 
 impl Scene for Site {
-    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>) -> Option<Hit> {
+    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>, near: f64) -> Option<Hit> {
         self.surface
-            .hit(&self.rocks, origin, ray, NEAR, self.light.far())
+            .hit(&self.rocks, origin, ray, near, self.light.far())
+    }
+
+    fn clear_until(&self, origin: &Point3<f64>, corners: &[Vector3<f64>; 4]) -> f64 {
+        let far = self.light.far();
+        self.surface
+            .clear_until(&self.rocks, origin, corners, NEAR, far)
     }
 
     fn light(&self, look: &Look, hit: Option<&Hit>) -> Vector3<f32> {
@@ -227,7 +233,7 @@ impl Synth {
         self.truth(index, false, |u, v, hit| {
             let Some(hit) = hit else { return f32::NAN };
             let column = u - self.rig.fx * self.rig.baseline / hit.t;
-            let seen = self.site.hit(&right.origin, &right.ray(column, v));
+            let seen = self.site.hit(&right.origin, &right.ray(column, v), NEAR);
             // Depth is the parameter of both rays.
             let hidden = seen.is_some_and(|seen| seen.t < hit.t * (1.0 - 1e-3));
             f32::from(u8::from(hidden || column < -0.5))

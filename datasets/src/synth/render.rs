@@ -6,8 +6,11 @@ use super::surface::Hit;
 
 /// What can be looked at.
 pub(super) trait Scene: Sync {
-    /// The first thing that a ray meets.
-    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>) -> Option<Hit>;
+    /// The first thing that a ray meets after parameter `near`.
+    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>, near: f64) -> Option<Hit>;
+
+    /// A parameter before which no ray between four meets anything: where to begin to look.
+    fn clear_until(&self, origin: &Point3<f64>, corners: &[Vector3<f64>; 4]) -> f64;
 
     /// The light (linear red, green, blue) that comes back along a ray from what it met, averaged
     /// over the pixel.
@@ -127,14 +130,50 @@ fn middle(rig: &RectifiedRig, T_world_left: &Se3) -> Point3<f64> {
     T_world_left * Point3::new(rig.baseline / 2.0, 0.0, 0.0)
 }
 
+/// For square tiles of the image, where to begin to look: pixels next to each other fly over the
+/// same ground, and share that part of the way.
+struct Clear {
+    across: usize,
+    until: Vec<f64>,
+}
+
+impl Clear {
+    const TILE: usize = 16;
+
+    fn new(scene: &impl Scene, view: &View) -> Self {
+        let across = view.width.div_ceil(Self::TILE);
+        let tiles = across * view.height.div_ceil(Self::TILE);
+        let until = |k: usize| {
+            // A pixel more on each side, for rays beside the middle of a pixel and for bent lenses.
+            let [u, v] = [k % across, k / across].map(|n| (n * Self::TILE) as f64);
+            let (from, to) = (-1.5, Self::TILE as f64 + 0.5);
+            let corners = [(from, from), (to, from), (from, to), (to, to)];
+            scene.clear_until(&view.origin, &corners.map(|(a, b)| view.ray(u + a, v + b)))
+        };
+        Self {
+            across,
+            until: (0..tiles).into_par_iter().map(until).collect(),
+        }
+    }
+
+    fn at(&self, u: usize, v: usize) -> f64 {
+        self.until[v / Self::TILE * self.across + u / Self::TILE]
+    }
+}
+
 /// What each pixel's middle meets, row by row.
 pub(super) fn hits(scene: &impl Scene, view: &View) -> Vec<Option<Hit>> {
+    hits_after(scene, view, &Clear::new(scene, view))
+}
+
+fn hits_after(scene: &impl Scene, view: &View, clear: &Clear) -> Vec<Option<Hit>> {
     let mut hits = vec![None; view.width * view.height];
     hits.par_chunks_exact_mut(view.width)
         .enumerate()
         .for_each(|(v, row)| {
             for (u, hit) in row.iter_mut().enumerate() {
-                *hit = scene.hit(&view.origin, &view.ray(u as f64, v as f64));
+                let ray = view.ray(u as f64, v as f64);
+                *hit = scene.hit(&view.origin, &ray, clear.at(u, v));
             }
         });
     hits
@@ -154,7 +193,8 @@ pub(super) fn render(scene: &impl Scene, view: &View) -> Vec<f32> {
     /// Pixels that a pixel's light comes from, across: lenses are a little less sharp than sensors.
     const SPREAD: f64 = 1.25;
     let (w, h) = (view.width, view.height);
-    let hits = hits(scene, view);
+    let clear = Clear::new(scene, view);
+    let hits = hits_after(scene, view, &clear);
     let mut image = vec![0.0f32; 3 * w * h];
     image
         .par_chunks_exact_mut(3 * w)
@@ -173,7 +213,8 @@ pub(super) fn render(scene: &impl Scene, view: &View) -> Vec<f32> {
                 let light = if on_outline {
                     let shared = |(du, dv): &(f64, f64)| {
                         let look = view.look(at.0 + du, at.1 + dv, 0.5 * SPREAD);
-                        scene.light(&look, scene.hit(&look.origin, &look.ray).as_ref())
+                        let hit = scene.hit(&look.origin, &look.ray, clear.at(u, v));
+                        scene.light(&look, hit.as_ref())
                     };
                     SHARED.iter().map(shared).sum::<Vector3<f32>>() / 4.0
                 } else {

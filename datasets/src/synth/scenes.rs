@@ -5,6 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
+use super::NEAR;
 use super::camera::{Sensor, Shot};
 use super::noise::add_noise;
 use super::options::Options;
@@ -209,7 +210,7 @@ impl Shape {
             }
             Body::Faces(_) => return None,
         };
-        (t > 0.05).then_some((t, 0))
+        (t > NEAR).then_some((t, 0))
     }
 
     /// At a point of the shape (counted from its centre): the outward normal, and the position and
@@ -250,7 +251,7 @@ fn first_root(a: f64, b: f64, c: f64, accept: impl Fn(f64) -> bool) -> Option<f6
     // NaN compares false: no root, none found.
     [(-b - root) / a, (-b + root) / a]
         .into_iter()
-        .find(|t| *t > 0.05 && accept(*t))
+        .find(|t| *t > NEAR && accept(*t))
 }
 
 impl<'a> Shapes<'a> {
@@ -354,11 +355,15 @@ impl<'a> Shapes<'a> {
 }
 
 impl Scene for Shapes<'_> {
-    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>) -> Option<Hit> {
+    fn clear_until(&self, _: &Point3<f64>, _: &[Vector3<f64>; 4]) -> f64 {
+        NEAR
+    }
+
+    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>, near: f64) -> Option<Hit> {
         let mut best: Option<Hit> = None;
         for (id, shape) in self.shapes.iter().enumerate() {
             if let Some((t, face)) = shape.hit(&origin.coords, ray)
-                && t > 0.05
+                && t > near
                 && best.is_none_or(|best| t < best.t)
             {
                 best = Some(Hit {

@@ -133,8 +133,8 @@ impl Surface {
 
     /// The first `t` in `near..far` at which `origin + t direction` meets the surface or a rock.
     ///
-    /// Walks the squares of the bounds: a square that the ray flies over is left in one step and
-    /// the next one tried is larger; one that it may hit is tried in quarters. In squares of the
+    /// Walks the squares of the bounds: a square that the ray flies over is left in one step, and
+    /// where that leads into another larger one, it is tried next; one that it may hit is tried in quarters. In squares of the
     /// rocks' level the rocks are asked; within a single cell the surface itself.
     pub fn hit(
         &self,
@@ -195,7 +195,13 @@ impl Surface {
             }
             if p.z + exit * fall > f64::from(bound) {
                 t += exit + ACROSS;
-                level = (level + 1).min(top);
+                // Into a square of which the next larger one has not been tried.
+                let leaves = if exit_x < exit_y {
+                    i & 1 == ahead.0
+                } else {
+                    j & 1 == ahead.1
+                };
+                level = (level + usize::from(leaves)).min(top);
                 continue;
             }
             if level == rocks.level() && asked != Some((i, j)) {
@@ -217,6 +223,47 @@ impl Surface {
             }
         }
         (best.t < far).then_some(best)
+    }
+
+    /// A parameter in `near..=far` before which no ray between the `corners`' meets anything.
+    pub fn clear_until(
+        &self,
+        rocks: &Rocks,
+        origin: &Point3<f64>,
+        corners: &[Vector3<f64>; 4],
+        near: f64,
+        far: f64,
+    ) -> f64 {
+        let from = origin - self.origin;
+        let mut t = near;
+        while t < far {
+            // The box around this part of the pencil of rays.
+            let next = 1.12 * t + 0.02;
+            let ends = corners
+                .iter()
+                .flat_map(|ray| [t, next].map(|t| from + ray * t));
+            let (low, high) = ends.fold(
+                (Vector3::repeat(f64::MAX), Vector3::repeat(f64::MIN)),
+                |(low, high), p| (low.inf(&p), high.sup(&p)),
+            );
+            let wide = (high - low).xy().max() / self.cell;
+            // A level at which few squares cover it.
+            let least = rocks.level();
+            let top = self.bounds.len() - 1;
+            let level = (wide.max(1.0).log2() as usize).clamp(least, top.max(least));
+            let [i0, i1, j0, j1] =
+                [low.x, high.x, low.y, high.y].map(|c| floor(c / self.cell) >> level);
+            let side = self.side >> level;
+            let over = |i: i32, j: i32| {
+                let square = (j as usize & (side - 1)) * side + (i as usize & (side - 1));
+                low.z > f64::from(self.bounds[level][square].max(rocks.bound(level, square)))
+            };
+            if !(j0..=j1).all(|j| (i0..=i1).all(|i| over(i, j))) {
+                return t;
+            }
+            t = next;
+        }
+        far
     }
 
     /// [`Surface::hit`] within one cell: three brackets, then the Illinois form of regula falsi.
