@@ -39,6 +39,6 @@ pub use pairs::PairSource;
 pub use prefetch::{Prefetch, prefetch};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
-pub use synth::Synth;
+pub use synth::{RandomScenes, Synth};
 pub use text::read_planar;
-pub use write_folder::write_folder;
+pub use write_folder::{write_folder, write_synth};

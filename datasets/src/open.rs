@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use crate::formats::ON_DISK;
-use crate::{Corrected, Correction, DataError, StereoSource, Synth};
+use crate::{Corrected, Correction, DataError, StereoSource, synth};
 
 /// How to write a rendered traverse.
 const SYNTH: &str = "synth:seed=1,frames=60";
@@ -55,7 +55,7 @@ pub fn open_as_stored(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
             .or((spec == "synth").then_some((spec, "")))
     {
         if name == "synth" {
-            return Ok(Box::new(Synth::parse(rest)?));
+            return synth::open(rest);
         }
         let Some(format) = ON_DISK.iter().find(|f| f.name == name) else {
             let message = format!("unknown format \"{name}\"; known: {}", known());

@@ -150,7 +150,10 @@ pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
         }
     }
     let swapped = is_swapped(&looks);
-    let poses = if swapped || pairing.lag != 0 {
+    // Pairs that do not fit together, and a keystone, which may be a yaw that shifts every disparity,
+    // leave nothing to compare poses with.
+    let keystone = rows.is_some_and(|rows| rows.yaw != 0.0);
+    let poses = if swapped || pairing.lag != 0 || keystone {
         None
     } else {
         poses::pose_scale(source, &looks, rows.as_ref())?

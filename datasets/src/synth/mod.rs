@@ -1,303 +1,370 @@
-//! A rendered rover traverse with exact truth, for tests and for a first run without any data.
+//! A rendered rover traverse with exact truth, for tests, for training and for a first run without
+//! any data; and random scenes for pretraining.
 //!
-//! A mast camera pair drives a wide circle over sand with ripples, craters and rocks, ringed by
-//! hills, under a low sun. Both images look at the same surface, so disparity, trajectory and the
-//! ground itself are known exactly. A seed gives the same bytes every time, whatever frames were
-//! asked for before.
+//! A mast camera pair drives over sand with ripples, craters, tracks and rocks, ringed by hills,
+//! under a low sun; or over the ground of a digital elevation model. Both images look at the same
+//! surface, so disparity, occlusion, trajectory, sensors and the ground itself are known exactly. A
+//! seed gives the same bytes every time, whatever frames were asked for before.
 #![allow(non_snake_case)] // A pose's name tells its frames: T_world_cam.
 
-mod ground;
+mod camera;
+mod dem;
+mod light;
 mod noise;
+mod options;
+mod relief;
+mod render;
+mod rocks;
+mod rover;
+mod scenes;
+mod sensors;
+mod skin;
+mod surface;
 mod texture;
 
-use barchan_geometry::nalgebra::{Matrix3, Rotation3, Translation3};
-use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
-use nalgebra::{Matrix2, Point3, UnitQuaternion, Vector2, Vector3};
-use rand::Rng;
+use std::sync::OnceLock;
+
+use barchan_geometry::{Rectification, RectifiedRig, Rig, Se3, StampedPose, Trajectory};
+use nalgebra::{Point3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
 use crate::pairs::no_frame;
-use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource};
-use ground::{CELL, Ground, ROUTE_RADIUS};
-use noise::add_noise;
-use texture::{Footprint, Texture};
+use crate::resample::remap;
+use crate::{DataError, Plane, Rgb, Sensors, StereoFrame, StereoSource};
+use camera::{Sensor, Shot};
+use light::Light;
+use options::Options;
+use render::{Look, Scene, View};
+use rocks::Rocks;
+use rover::Plan;
+use skin::Skin;
+use surface::{Hit, Surface};
 
-/// The options of a synthetic traverse.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Options {
-    /// Chooses the ground, the route and the noise.
-    seed: u64,
-    /// How many frames. About 700 drive the circle once.
-    frames: usize,
-    /// Image width, pixels.
-    width: usize,
-    /// Image height, pixels.
-    height: usize,
-    /// Standard deviation of the sensor noise, grey levels of 255.
-    noise: f64,
-}
+pub use options::OPTIONS;
+pub use rocks::Rock;
+pub use scenes::RandomScenes;
 
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            seed: 1,
-            frames: 60,
-            width: 384,
-            height: 288,
-            noise: 1.0,
-        }
-    }
-}
+/// Seconds between frames.
+const INTERVAL: f64 = 0.2;
+/// Nearest and farthest depth of anything seen, metres; beyond lies the haze.
+const NEAR: f64 = 0.05;
+/// Sensor streams of longer sequences would not fit into memory.
+const MOST_WITH_SENSORS: usize = 100_000;
+/// Renders that share the time of an exposure.
+const BLUR_STEPS: usize = 6;
 
 /// Format `synth`: the rendered traverse.
 pub struct Synth {
     options: Options,
     rig: RectifiedRig,
-    ground: Ground,
-    grain: Texture<1>,
+    /// The cameras as they are, where images are rectified on reading.
+    crooked: Option<(Rig, Rectification)>,
+    plan: Plan,
+    site: Site,
+    sensor: Sensor,
     trajectory: Trajectory,
+    /// Made when first asked for.
+    sensors: OnceLock<Sensors>,
 }
 
-/// Metres driven between frames.
-const STEP: f64 = 0.08;
-/// Seconds between frames.
-const INTERVAL: f64 = 0.2;
-/// Height of the camera above the ground, metres.
-const MAST: f64 = 0.8;
-/// How far the camera looks down, radians.
-const PITCH: f64 = 0.36;
-/// Farther than this, metres, the haze has swallowed everything.
-const FAR: f64 = 40.0;
-/// Side of the grain texture, and the metres of its texel in its fine and its coarse use.
-const GRAIN: usize = 1024;
-const FINE: f32 = 0.0023;
-const COARSE: f32 = 0.0171;
+/// The ground, what stands on it and the light: all that can be seen.
+struct Site {
+    surface: Surface,
+    rocks: Rocks,
+    light: Light,
+    skin: Skin,
+}
+
+impl Scene for Site {
+    fn hit(&self, origin: &Point3<f64>, ray: &Vector3<f64>, near: f64) -> Option<Hit> {
+        self.surface
+            .hit(&self.rocks, origin, ray, near, self.light.far())
+    }
+
+    fn clear_until(&self, origin: &Point3<f64>, corners: &[Vector3<f64>; 4]) -> f64 {
+        let far = self.light.far();
+        self.surface
+            .clear_until(&self.rocks, origin, corners, NEAR, far)
+    }
+
+    fn light(&self, look: &Look, hit: Option<&Hit>) -> Vector3<f32> {
+        let Some(hit) = hit else {
+            return self.light.beyond(&look.ray);
+        };
+        let point = look.origin + look.ray * hit.t;
+        let light = match hit.body {
+            None => self
+                .skin
+                .ground(&self.surface, &self.light, look, hit.t, &point),
+            Some((id, face)) => {
+                let centre = self.rocks.centre_near(id, &point);
+                let rock = &self.rocks.list[id as usize];
+                // A little outside of the face, so that the rock is not met again.
+                let outside = point + rock.faces[face as usize].0 * 1e-4;
+                let to_sun = &self.light.to_sun;
+                let sunlit = (rock.faces[face as usize].0.dot(to_sun) > -0.3
+                    && self
+                        .surface
+                        .hit(&self.rocks, &outside, to_sun, 1e-4, 12.0)
+                        .is_none())
+                .into();
+                let local = point - centre;
+                self.skin
+                    .rock(rock, face, &local, sunlit, &self.light, look, hit.t)
+            }
+        };
+        self.light.through_haze(light, hit.t)
+    }
+}
 
 impl Synth {
-    /// Reads `seed=1,frames=60,width=384,height=288,noise=1`, each optional.
+    /// Reads `seed=1,frames=60,...`, each optional; [`OPTIONS`] lists them.
     ///
     /// # Errors
-    /// When an option is unknown or out of range; the message names it.
+    /// When an option is unknown or out of range, or a DEM cannot be used; the message names it.
     pub fn parse(spec: &str) -> Result<Self, DataError> {
-        let mut options = Options::default();
-        let bad = |message: String| DataError::Layout {
-            spec: format!("synth:{spec}"),
-            message,
-        };
-        for item in spec
-            .split(',')
-            .map(str::trim)
-            .filter(|item| !item.is_empty())
-        {
-            let (key, value) = item.split_once('=').unwrap_or((item, ""));
-            let whole = |least: usize, most: usize| {
-                value
-                    .parse()
-                    .ok()
-                    .filter(|v| (least..=most).contains(v))
-                    .ok_or_else(|| {
-                        bad(format!(
-                            "{key} is \"{value}\", expected a whole number from {least} to {most}"
-                        ))
-                    })
-            };
-            match key {
-                "seed" => {
-                    options.seed = value.parse().map_err(|_| {
-                        bad(format!("seed is \"{value}\", expected a whole number"))
-                    })?;
-                }
-                "frames" => options.frames = whole(1, 1_000_000)?,
-                "width" => options.width = whole(32, 4096)?,
-                "height" => options.height = whole(32, 4096)?,
-                "noise" => {
-                    options.noise = value
-                        .parse()
-                        .ok()
-                        .filter(|v| (0.0..=50.0).contains(v))
-                        .ok_or_else(|| {
-                            bad(format!(
-                                "noise is \"{value}\", expected grey levels from 0 to 50"
-                            ))
-                        })?;
-                }
-                _ => {
-                    return Err(bad(format!(
-                        "unknown option \"{key}\"; known: seed, frames, width, height, noise"
-                    )));
-                }
-            }
-        }
-        Ok(Self::new(options))
+        Self::new(Options::parse(spec, false)?)
     }
 
     /// Makes the ground and the route. Frames are rendered when asked for.
-    fn new(options: Options) -> Self {
-        let focal = 0.8 * options.width as f64;
-        let rig = RectifiedRig {
-            width: options.width,
-            height: options.height,
-            fx: focal,
-            fy: focal,
-            cx: (options.width as f64 - 1.0) / 2.0,
-            cy: (options.height as f64 - 1.0) / 2.0,
-            doffs: 0.0,
-            baseline: 0.12,
+    fn new(options: Options) -> Result<Self, DataError> {
+        let mut plan = Plan::new(&options);
+        let (surface, rocks) = match &options.dem {
+            None => relief::build(&options, &plan),
+            Some(path) => dem::build(path, &options, &mut plan)?,
         };
-        let ground = Ground::new(options.seed);
-        let grain = grain(options.seed as u32, ground.light_along);
-        let pose = |i: usize| StampedPose {
-            time: i as f64 * INTERVAL,
-            T_world_cam: pose(&ground, options.seed, i),
+        let mut rng = ChaCha8Rng::seed_from_u64(options.seed ^ 0x5017);
+        let light = Light::new(&options, &mut rng);
+        let skin = Skin::new(&surface, &rocks, &light, &options);
+
+        let straight = straight_rig(&options);
+        let crooked = (!options.rectified).then(|| {
+            let rig = crooked_rig(&straight, &mut rng);
+            let rectification = Rectification::new(&rig);
+            (rig, rectification)
+        });
+        let rig = crooked.as_ref().map_or(straight, |(_, r)| r.rig);
+        let pose = |i: usize| {
+            let time = i as f64 * INTERVAL;
+            StampedPose {
+                time,
+                T_world_cam: plan.T_world_cam(&surface, time),
+            }
         };
         let trajectory = Trajectory {
             poses: (0..options.frames).into_par_iter().map(pose).collect(),
         };
-        Self {
-            options,
+        Ok(Self {
             rig,
-            ground,
-            grain,
+            crooked,
+            sensor: Sensor::new(options.camera, options.seed, options.width, options.height),
+            plan,
+            site: Site {
+                surface,
+                rocks,
+                light,
+                skin,
+            },
             trajectory,
-        }
-    }
-
-    /// Height of the true ground, metres, world z up. What it is evaluated on by the renderer,
-    /// so a map may be compared with it point by point.
-    pub fn ground_height(&self, x: f64, y: f64) -> f64 {
-        self.ground.height(x, y)
-    }
-
-    /// The ray through a pixel, in the world. It has z = 1 in the camera, so that the parameter
-    /// along it is the depth.
-    fn ray(&self, T_world_cam: &Se3, u: f64, v: f64) -> Vector3<f64> {
-        let rig = &self.rig;
-        T_world_cam.rotation * Vector3::new((u - rig.cx) / rig.fx, (v - rig.cy) / rig.fy, 1.0)
-    }
-
-    /// What a camera `shift` metres to the right of the left one sees at a pixel.
-    fn look(&self, T_world_cam: &Se3, shift: f64, u: f64, v: f64) -> Option<Hit> {
-        let origin = T_world_cam * Point3::new(shift, 0.0, 0.0);
-        let ray = self.ray(T_world_cam, u, v);
-        let depth = self.ground.hit(&origin, &ray, 0.05, FAR)?;
-        Some(Hit {
-            depth,
-            point: origin + ray * depth,
-            ray,
+            sensors: OnceLock::new(),
+            options,
         })
     }
 
-    fn render(&self, index: usize, right: bool) -> Rgb {
-        let T_world_cam = self.trajectory.poses[index].T_world_cam;
-        let shift = if right { self.rig.baseline } else { 0.0 };
+    /// Height of what is seen from above, metres, world z up: the ground or the rock that stands
+    /// there. NaN beyond the end of a DEM.
+    pub fn ground_height(&self, x: f64, y: f64) -> f64 {
+        self.bare_ground_height(x, y)
+            .max(self.site.rocks.top(&self.site.surface, x, y))
+    }
+
+    /// Height of the ground without rocks, metres. With a DEM, at its nodes it is the DEM's.
+    pub fn bare_ground_height(&self, x: f64, y: f64) -> f64 {
+        self.site.surface.height(x, y)
+    }
+
+    /// Every rock. Where the ground repeats (every 40.96 m along x and y, without a DEM), so do they.
+    pub fn rocks(&self) -> &[Rock] {
+        &self.site.rocks.list
+    }
+
+    /// The rig that images are taken with before rectification, for `rectified=false`.
+    pub fn unrectified_rig(&self) -> Option<&Rig> {
+        self.crooked.as_ref().map(|(rig, _)| rig)
+    }
+
+    /// The time of a frame, seconds.
+    pub(crate) fn time(&self, index: usize) -> f64 {
+        index as f64 * INTERVAL
+    }
+
+    /// The poses of the left camera that takes the images of [`Synth::photograph`].
+    pub(crate) fn trajectory_of_images(&self) -> Trajectory {
+        let mut trajectory = self.trajectory.clone();
+        if let Some((_, rectification)) = &self.crooked {
+            for pose in &mut trajectory.poses {
+                pose.T_world_cam *= rectification.R_rect_left;
+            }
+        }
+        trajectory
+    }
+
+    /// True depth of the left image of frame `index`, metres along the optical axis; NaN where
+    /// nothing is near enough.
+    ///
+    /// # Errors
+    /// When there is no such frame.
+    pub fn true_depth(&self, index: usize) -> Result<Plane, DataError> {
+        let depth = |hit: Option<&Hit>| hit.map_or(f32::NAN, |hit| hit.t as f32);
+        self.truth(index, false, |_, _, hit| depth(hit))
+    }
+
+    /// Where the right camera does not see what the left image of frame `index` shows: 1 there, 0
+    /// where it does, NaN where nothing is near enough. What lies outside the right image counts as
+    /// not seen.
+    ///
+    /// # Errors
+    /// When there is no such frame.
+    pub fn true_occlusion(&self, index: usize) -> Result<Plane, DataError> {
+        let pose = self.pose(index)?;
+        let right = self.view(&pose, true);
+        self.truth(index, false, |u, v, hit| {
+            let Some(hit) = hit else { return f32::NAN };
+            let column = u - self.rig.fx * self.rig.baseline / hit.t;
+            let seen = self.site.hit(&right.origin, &right.ray(column, v), NEAR);
+            // Depth is the parameter of both rays.
+            let hidden = seen.is_some_and(|seen| seen.t < hit.t * (1.0 - 1e-3));
+            f32::from(u8::from(hidden || column < -0.5))
+        })
+    }
+
+    /// A plane of what the rays of one camera meet.
+    fn truth(
+        &self,
+        index: usize,
+        right: bool,
+        value: impl Fn(f64, f64, Option<&Hit>) -> f32 + Sync,
+    ) -> Result<Plane, DataError> {
+        let view = self.view(&self.pose(index)?, right);
         let (w, h) = (self.rig.width, self.rig.height);
-        let mut image = vec![0.0f32; 3 * w * h];
-        image
-            .par_chunks_exact_mut(3 * w)
-            .enumerate()
-            .for_each(|(v, row)| {
-                for (u, pixel) in row.chunks_exact_mut(3).enumerate() {
-                    let (u, v) = (u as f64, v as f64);
-                    let colour = match self.look(&T_world_cam, shift, u, v) {
-                        Some(hit) => self.surface(&T_world_cam, &hit),
-                        None => sky(&self.ray(&T_world_cam, u, v)),
-                    };
-                    pixel.copy_from_slice(colour.as_slice());
-                }
-            });
-        self.add_noise(&mut image, 2 * index as u64 + u64::from(right));
-        // Three values a pixel by construction.
-        Rgb::from_raw(w as u32, h as u32, image).unwrap_or_default()
+        let hits = render::hits(&self.site, &view);
+        let of =
+            |(k, hit): (usize, &Option<Hit>)| value((k % w) as f64, (k / w) as f64, hit.as_ref());
+        let values = hits.par_iter().enumerate().map(of).collect();
+        // One value a pixel by construction.
+        Ok(Plane::from_raw(w as u32, h as u32, values).unwrap_or_default())
     }
 
-    /// Colour of the ground at a hit, averaged over the pixel.
-    fn surface(&self, T_world_cam: &Se3, hit: &Hit) -> Vector3<f32> {
-        let (x, y) = (hit.point.x, hit.point.y);
-        let over = self.footprint(T_world_cam, hit);
-        let scaled = |metres: f32| Footprint {
-            major: over.major / metres,
-            minor: over.minor / metres,
-        };
-        // Positions in the grain wrap: reduce them in f64 first, or far from the origin they blur.
-        let texel = |x: f64, y: f64, metres: f32| {
-            let wrapped = |v: f64| (v / f64::from(metres)).rem_euclid(GRAIN as f64) as f32;
-            Vector2::new(wrapped(x), wrapped(y))
-        };
-        let node = Vector2::new((x / CELL) as f32, (y / CELL) as f32);
-        let [light, rock] = self.ground.light_and_rock.mean(node, scaled(CELL as f32));
-        // The same grain twice, turned and at incommensurate scales: together it does not repeat.
-        let [fine] = self.grain.mean(texel(x, y, FINE), scaled(FINE));
-        let (s, c) = 0.65f32.sin_cos();
-        let turn = Matrix2::new(c, s, -s, c);
-        let turned = turn.cast::<f64>() * Vector2::new(x, y);
-        let coarse_over = Footprint {
-            major: turn * over.major / COARSE,
-            minor: over.minor / COARSE,
-        };
-        let [coarse] = self
-            .grain
-            .mean(texel(turned.x, turned.y, COARSE), coarse_over);
-
-        let sand = Vector3::new(0.78, 0.56, 0.38);
-        let stone = Vector3::new(0.56, 0.46, 0.39) * (0.4 + rock);
-        let is_rock = (2.0 * rock).min(1.0);
-        let albedo =
-            (sand * (1.0 - is_rock) + stone * is_rock) * (1.0 + 0.22 * fine + 0.16 * coarse);
-        let clear = (-(hit.depth / 24.0).powi(2)).exp() as f32;
-        (albedo * light * clear + haze(0.0) * (1.0 - clear)).map(|v| v.clamp(0.0, 1.0))
+    fn pose(&self, index: usize) -> Result<Se3, DataError> {
+        let poses = &self.trajectory.poses;
+        let pose = poses
+            .get(index)
+            .ok_or_else(|| no_frame(index, poses.len()))?;
+        Ok(pose.T_world_cam)
     }
 
-    /// What a pixel covers of the ground plan (ray differentials, Igehy 1999).
-    fn footprint(&self, T_world_cam: &Se3, hit: &Hit) -> Footprint {
-        let normal = self.ground.normal(hit.point.x, hit.point.y);
-        let towards = normal.dot(&hit.ray).min(-1e-3);
-        let across = |step: Vector3<f64>| {
-            let step = T_world_cam.rotation * step;
-            ((step - hit.ray * (normal.dot(&step) / towards)) * hit.depth)
-                .xy()
-                .cast::<f32>()
+    fn view(&self, T_world_cam: &Se3, right: bool) -> View<'static> {
+        let shift = if right { self.rig.baseline } else { 0.0 };
+        View::rectified(&self.rig, T_world_cam, shift)
+    }
+
+    /// The left and right images of frame `index` as the cameras take them: of
+    /// [`Synth::unrectified_rig`] where there is one, else rectified.
+    ///
+    /// # Errors
+    /// When there is no such frame.
+    pub fn photograph(&self, index: usize) -> Result<[Rgb; 2], DataError> {
+        self.pose(index)?;
+        let [(left, sun_left), (right, sun_right)] = [false, true].map(|r| self.expose(index, r));
+        let exposure = self.sensor.meter(&left);
+        let developed = |mut image: Vec<f32>, right: bool, sun| {
+            let shot = Shot {
+                frame: index,
+                right,
+                exposure,
+                sun,
+            };
+            self.sensor.develop(&mut image, shot);
+            // Three values a pixel by construction.
+            Rgb::from_raw(self.rig.width as u32, self.rig.height as u32, image).unwrap_or_default()
         };
-        let a = across(Vector3::new(1.0 / self.rig.fx, 0.0, 0.0));
-        let b = across(Vector3::new(0.0, 1.0 / self.rig.fy, 0.0));
-        let major = if a.norm_squared() > b.norm_squared() {
-            a
+        Ok([
+            developed(left, false, sun_left),
+            developed(right, true, sun_right),
+        ])
+    }
+
+    /// The light on one camera's pixels over the time of the exposure, and where the sun stands.
+    fn expose(&self, index: usize, right: bool) -> (Vec<f32>, Option<nalgebra::Vector2<f64>>) {
+        let middle = index as f64 * INTERVAL;
+        let blur = self.options.camera.blur;
+        let steps = if blur > 0.0 { BLUR_STEPS } else { 1 };
+        let mut sum = Vec::new();
+        for k in 0..steps {
+            let time = middle + blur * ((k as f64 + 0.5) / steps as f64 - 0.5);
+            let T_world_rect = self.plan.T_world_cam(&self.site.surface, time);
+            let light = match &self.crooked {
+                None => render::render(&self.site, &self.view(&T_world_rect, right)),
+                Some(crooked) => render::render(
+                    &self.site,
+                    &self.crooked_view(crooked, &T_world_rect, right),
+                ),
+            };
+            if sum.is_empty() {
+                sum = light;
+            } else {
+                sum.iter_mut().zip(light).for_each(|(sum, l)| *sum += l);
+            }
+        }
+        sum.iter_mut().for_each(|l| *l /= steps as f32);
+        let T_world_cam = self.trajectory.poses[index].T_world_cam;
+        let sun = self
+            .view(&T_world_cam, right)
+            .pixel(&self.site.light.to_sun);
+        (sum, sun)
+    }
+
+    fn crooked_view<'a>(
+        &self,
+        (rig, rectification): &'a (Rig, Rectification),
+        T_world_rect: &Se3,
+        right: bool,
+    ) -> View<'a> {
+        let (camera, R_rect_cam, shift) = if right {
+            (&rig.right, rectification.R_rect_right, self.rig.baseline)
         } else {
-            b
+            (&rig.left, rectification.R_rect_left, 0.0)
         };
-        Footprint {
-            major,
-            minor: a.perp(&b).abs() / major.norm().max(1e-9),
-        }
-    }
-
-    /// Sensor noise, from a stream of its own for each image.
-    fn add_noise(&self, image: &mut [f32], stream: u64) {
-        if self.options.noise == 0.0 {
-            return;
-        }
-        let mut rng = ChaCha8Rng::seed_from_u64(self.options.seed);
-        rng.set_stream(stream + 1);
-        // The sum of four uniform bytes is near enough to normal, and the same on every machine:
-        // mean 510, variance 4 (256^2 - 1) / 12.
-        let scale = self.options.noise as f32 / 255.0 / 147.8;
-        for value in image {
-            let sum: u32 = rng
-                .next_u32()
-                .to_le_bytes()
-                .into_iter()
-                .map(u32::from)
-                .sum();
-            *value = (*value + (sum as f32 - 510.0) * scale).clamp(0.0, 1.0);
-        }
+        View::bent(&self.rig, T_world_rect, shift, camera, &R_rect_cam)
     }
 }
 
-struct Hit {
-    depth: f64,
-    point: Point3<f64>,
-    ray: Vector3<f64>,
+/// Opens what follows `synth:`, a traverse or `scenes,...`.
+///
+/// # Errors
+/// As [`Synth::parse`] and [`RandomScenes::parse`].
+pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
+    match spec.split_once(',').unwrap_or((spec, "")) {
+        ("scenes", rest) => Ok(Box::new(RandomScenes::parse(rest)?)),
+        _ => Ok(Box::new(Synth::parse(spec)?)),
+    }
+}
+
+/// The rig asked for, its optical axes in the middle of the images.
+fn straight_rig(options: &Options) -> RectifiedRig {
+    let focal = 0.8 * options.width as f64;
+    RectifiedRig {
+        width: options.width,
+        height: options.height,
+        fx: focal,
+        fy: focal,
+        cx: (options.width as f64 - 1.0) / 2.0,
+        cy: (options.height as f64 - 1.0) / 2.0,
+        doffs: 0.0,
+        baseline: options.baseline,
+    }
 }
 
 impl StereoSource for Synth {
@@ -310,316 +377,92 @@ impl StereoSource for Synth {
     }
 
     fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
-        let pose = self
-            .trajectory
-            .poses
-            .get(index)
-            .ok_or_else(|| no_frame(index, self.len()))?;
-        let (left, right) = (self.render(index, false), self.render(index, true));
+        let [mut left, mut right] = self.photograph(index)?;
+        if let Some((_, maps)) = &self.crooked {
+            left = remap(&left, &maps.left_map);
+            right = remap(&right, &maps.right_map);
+        }
         Ok(StereoFrame {
             index,
-            name: format!("{index:06}"),
-            time: pose.time,
+            name: self.name(index),
+            time: self.trajectory.poses[index].time,
             left,
             right,
         })
     }
 
     fn true_disparity(&self, index: usize) -> Result<Option<Plane>, DataError> {
-        let pose = self
-            .trajectory
-            .poses
-            .get(index)
-            .ok_or_else(|| no_frame(index, self.len()))?;
-        let (w, h) = (self.rig.width, self.rig.height);
-        let mut disparity = vec![f32::NAN; w * h];
-        disparity
-            .par_chunks_exact_mut(w)
-            .enumerate()
-            .for_each(|(v, row)| {
-                for (u, d) in row.iter_mut().enumerate() {
-                    if let Some(hit) = self.look(&pose.T_world_cam, 0.0, u as f64, v as f64) {
-                        *d = (self.rig.fx * self.rig.baseline / hit.depth) as f32;
-                    }
-                }
-            });
-        Ok(Plane::from_raw(w as u32, h as u32, disparity))
+        let scale = self.rig.fx * self.rig.baseline;
+        let disparity = |hit: &Hit| (scale / hit.t) as f32;
+        self.truth(index, false, |_, _, hit| hit.map_or(f32::NAN, disparity))
+            .map(Some)
+    }
+
+    fn true_disparity_right(&self, index: usize) -> Result<Option<Plane>, DataError> {
+        let scale = self.rig.fx * self.rig.baseline;
+        let disparity = |hit: &Hit| (scale / hit.t) as f32;
+        self.truth(index, true, |_, _, hit| hit.map_or(f32::NAN, disparity))
+            .map(Some)
     }
 
     fn true_trajectory(&self) -> Option<&Trajectory> {
         Some(&self.trajectory)
     }
-}
 
-/// The pose of frame `i`: on the route, tilted as the ground under the wheels.
-fn pose(ground: &Ground, seed: u64, i: usize) -> Se3 {
-    let start = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 11) as f64 / (1u64 << 53) as f64
-        * std::f64::consts::TAU;
-    let angle = start + i as f64 * STEP / ROUTE_RADIUS;
-    let at = |angle: f64| {
-        let radius = ROUTE_RADIUS + 0.8 * (3.0 * angle + start).sin();
-        Vector2::new(angle.cos(), angle.sin()) * radius
-    };
-    let here = at(angle);
-    let heading = (at(angle + 1e-4) - at(angle - 1e-4)).normalize();
-
-    // The plane that fits the ground best over the 1.4 m around: the wheels smooth what they roll over.
-    let (mut mean, mut slope) = (0.0, Vector2::zeros());
-    let reach = -7..=7;
-    let offsets = reach.clone().flat_map(|a| {
-        reach
-            .clone()
-            .map(move |b| Vector2::new(f64::from(a), f64::from(b)) * 0.1)
-    });
-    let mut spread = 0.0;
-    for offset in offsets.clone() {
-        let height = ground.height(here.x + offset.x, here.y + offset.y);
-        mean += height;
-        slope += offset * height;
-        spread += offset.x * offset.x;
+    /// IMU at 100 Hz, wheel odometry at 10 Hz and GNSS at 1 Hz; of sequences up to 100,000 frames.
+    fn sensors(&self) -> Option<&Sensors> {
+        let frames = self.options.frames;
+        let noise_seed = self.options.seed ^ 0x1305;
+        (frames <= MOST_WITH_SENSORS).then(|| {
+            self.sensors.get_or_init(|| {
+                sensors::measure(
+                    &self.plan,
+                    &self.site.surface,
+                    (frames - 1) as f64 * INTERVAL,
+                    self.rig.baseline,
+                    self.options.sensor_noise.then_some(noise_seed),
+                )
+            })
+        })
     }
-    mean /= offsets.count() as f64;
-    slope /= spread;
-
-    let up = Vector3::new(-slope.x, -slope.y, 1.0).normalize();
-    let ahead = Vector3::new(heading.x, heading.y, heading.dot(&slope)).normalize();
-    let z = ahead * PITCH.cos() - up * PITCH.sin();
-    let x = ahead.cross(&up);
-    let axes = Matrix3::from_columns(&[x, z.cross(&x), z]);
-    let position = Vector3::new(here.x, here.y, mean) + up * MAST;
-    Se3::from_parts(
-        Translation3::from(position),
-        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes)),
-    )
 }
 
-/// Dust in the air, by the sine of the elevation.
-fn haze(elevation: f32) -> Vector3<f32> {
-    let high = (elevation * 3.0).clamp(0.0, 1.0);
-    Vector3::new(0.74, 0.62, 0.49) * (1.0 - high) + Vector3::new(0.45, 0.37, 0.32) * high
-}
-
-fn sky(ray: &Vector3<f64>) -> Vector3<f32> {
-    haze((ray.z / ray.norm()) as f32)
-}
-
-/// Grains, pebbles and patches with as much contrast at every size, of mean about 0 and standard
-/// deviation about 1; the finest lit from the side as relief.
-fn grain(seed: u32, light_along: Vector2<f32>) -> Texture<1> {
-    let noise = |octaves: &[(u32, f32)], seed: u32| {
-        let mut image = vec![0.0f32; GRAIN * GRAIN];
-        image
-            .par_chunks_mut(GRAIN)
-            .enumerate()
-            .for_each(|(j, row)| {
-                for (k, (waves, amplitude)) in octaves.iter().enumerate() {
-                    add_noise(row, j, *waves, *amplitude, seed.wrapping_add(k as u32));
-                }
-            });
-        image
+/// A rig as it leaves a workshop: lenses that bend, unequal focal lengths, cameras turned by up to a
+/// degree.
+fn crooked_rig(straight: &RectifiedRig, rng: &mut ChaCha8Rng) -> Rig {
+    use barchan_geometry::{Camera, Distortion};
+    use rand::RngExt;
+    let mut camera = || Camera {
+        distortion: Distortion::RadTan([
+            rng.random_range(-0.22..-0.12),
+            rng.random_range(0.02..0.06),
+            rng.random_range(-1e-3..1e-3),
+            rng.random_range(-1e-3..1e-3),
+            0.0,
+        ]),
+        ..Camera::pinhole(
+            straight.fx * rng.random_range(0.99..1.01),
+            straight.fy * rng.random_range(0.99..1.01),
+            straight.cx + straight.fx * rng.random_range(-0.02..0.02),
+            straight.cy + straight.fy * rng.random_range(-0.02..0.02),
+        )
     };
-    let relief = noise(
-        &[(256, 4.0), (128, 8.0), (64, 16.0)],
-        seed.wrapping_add(200),
+    let (left, right) = (camera(), camera());
+    let turn = Vector3::from_fn(|_, _| rng.random_range(-0.01..0.01));
+    let off_axis = Vector3::new(
+        -straight.baseline,
+        straight.baseline * rng.random_range(-0.02..0.02),
+        straight.baseline * rng.random_range(-0.02..0.02),
     );
-    let patches = noise(
-        &[(200, 1.7), (96, 1.7), (47, 1.7), (23, 1.7), (11, 1.7)],
-        seed.wrapping_add(300),
-    );
-    let height = |i: usize, j: usize| relief[(j % GRAIN) * GRAIN + i % GRAIN];
-    let lit = |k: usize| {
-        let (i, j) = (k % GRAIN + GRAIN, k / GRAIN + GRAIN);
-        // A slope that rises along the light faces the sun.
-        let slope_x = height(i + 1, j) - height(i - 1, j);
-        let slope_y = height(i, j + 1) - height(i, j - 1);
-        [patches[k] + 0.45 * (light_along.x * slope_x + light_along.y * slope_y)]
-    };
-    Texture::new(GRAIN, (0..GRAIN * GRAIN).into_par_iter().map(lit).collect())
+    Rig {
+        width: straight.width,
+        height: straight.height,
+        left,
+        right,
+        T_right_left: Se3::new(off_axis, turn),
+        rectified: false,
+    }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::resample::cubic_weights;
-    use barchan_geometry::StereoPoint;
-
-    fn synth(spec: &str) -> Synth {
-        Synth::parse(spec).unwrap()
-    }
-
-    #[test]
-    fn the_right_image_warped_by_the_true_disparity_is_the_left_image() {
-        for seed in [1, 4] {
-            let synth = synth(&format!("seed={seed},frames=30,noise=0"));
-            let index = 17;
-            let T_world_cam = synth.trajectory.poses[index].T_world_cam;
-            let frame = synth.frame(index).unwrap();
-            let disparity = synth.true_disparity(index).unwrap().unwrap();
-            let (w, h) = disparity.dimensions();
-            let (mut error, mut seen, mut known, mut missed) = (0.0, 0, 0, 0);
-            for (u, v) in (0..h).flat_map(|v| (0..w).map(move |u| (u, v))) {
-                let d = f64::from(disparity[(u, v)].0[0]);
-                let at = f64::from(u) - d;
-                if d.is_nan() || at < 1.0 {
-                    continue;
-                }
-                known += 1;
-                // The right camera sees the same point there, or something before it; or, at an
-                // edge that both rays graze, just misses it.
-                let depth = synth.rig.depth(d);
-                let hit = synth.look(&T_world_cam, synth.rig.baseline, at, f64::from(v));
-                let there = hit.map_or(f64::INFINITY, |hit| hit.depth / depth);
-                missed += u32::from(there > 1.0 + 1e-3);
-                if (there - 1.0).abs() > 1e-3 {
-                    continue;
-                }
-                seen += 1;
-                let weights = cubic_weights(at.fract() as f32);
-                for c in 0..3 {
-                    let right: f32 = (0..4u32)
-                        .map(|k| {
-                            weights[k as usize]
-                                * frame.right[((at as u32 + k - 1).min(w - 1), v)].0[c]
-                        })
-                        .sum();
-                    error += f64::from((right - frame.left[(u, v)].0[c]).abs()) / 3.0;
-                }
-            }
-            let error = error / f64::from(seen) * 255.0;
-            assert!(missed < known / 1000, "{missed} of {known}");
-            assert!(error < 1.0, "mean error {error} grey levels");
-            assert!(
-                f64::from(seen) > 0.95 * f64::from(known),
-                "{seen} of {known}"
-            );
-            assert!(f64::from(known) > 0.75 * f64::from(w * h), "{known}");
-        }
-    }
-
-    #[test]
-    fn disparity_back_projects_onto_the_ground_along_the_trajectory() {
-        let synth = synth("seed=9,frames=300,width=128,height=96");
-        for index in [0, 150, 299] {
-            let T_world_cam = synth.true_trajectory().unwrap().poses[index].T_world_cam;
-            let disparity = synth.true_disparity(index).unwrap().unwrap();
-            let mut near = 0;
-            for (u, v, d) in disparity
-                .enumerate_pixels()
-                .filter(|p| p.2.0[0].is_finite())
-            {
-                let at = StereoPoint {
-                    u: f64::from(u),
-                    v: f64::from(v),
-                    d: f64::from(d.0[0]),
-                };
-                let p_cam = synth.rig.back_project(at).unwrap();
-                let p_world = T_world_cam * p_cam;
-                let above = p_world.z - synth.ground_height(p_world.x, p_world.y);
-                assert!(
-                    above.abs() < 2e-5 * p_cam.z.max(1.0),
-                    "{above} at {} m",
-                    p_cam.z
-                );
-                near += usize::from(d.0[0] > 1.0);
-            }
-            // At a third of the default width, a third of the default disparity.
-            assert!(near > 128 * 96 * 7 / 10, "{near}");
-        }
-    }
-
-    #[test]
-    fn the_rover_drives_on_and_looks_down_at_the_ground() {
-        let synth = synth("seed=2,frames=700,width=32,height=32");
-        let poses = &synth.true_trajectory().unwrap().poses;
-        for (a, b) in poses.iter().zip(&poses[1..]) {
-            let T_a_b = a.T_world_cam.inverse() * b.T_world_cam;
-            assert!(
-                (0.04..0.13).contains(&T_a_b.translation.vector.norm()),
-                "{T_a_b}"
-            );
-            assert!(T_a_b.rotation.angle() < 0.06, "{}", T_a_b.rotation.angle());
-            assert!((b.time - a.time - INTERVAL).abs() < 1e-9);
-            let at = a.T_world_cam.translation.vector;
-            let above = at.z - synth.ground_height(at.x, at.y);
-            assert!((0.5..1.1).contains(&above), "{above}");
-            let down = -(a.T_world_cam.rotation * Vector3::z()).z.asin();
-            assert!((0.05..0.7).contains(&down), "{down}");
-        }
-    }
-
-    #[test]
-    fn a_seed_fixes_every_byte_and_another_changes_them() {
-        let spec = "seed=5,frames=9,width=64,height=48";
-        let (a, b, other) = (
-            synth(spec),
-            synth(spec),
-            synth("seed=6,frames=9,width=64,height=48"),
-        );
-        // In another order, after other frames.
-        let first = a.frame(7).unwrap();
-        b.frame(8).unwrap();
-        b.frame(0).unwrap();
-        let again = b.frame(7).unwrap();
-        assert_eq!((&first.left, &first.right), (&again.left, &again.right));
-        assert_ne!(first.left, other.frame(7).unwrap().left);
-        assert_ne!(first.left, a.frame(6).unwrap().left);
-        assert_eq!(a.true_trajectory(), b.true_trajectory());
-        assert!(a.frame(9).is_err() && a.true_disparity(9).is_err());
-    }
-
-    #[test]
-    fn noise_has_the_deviation_asked_for() {
-        let (clean, noisy) = (synth("noise=0,frames=1"), synth("noise=2,frames=1"));
-        let (clean, noisy) = (clean.frame(0).unwrap(), noisy.frame(0).unwrap());
-        let power = |a: &Rgb, b: &Rgb| {
-            let middle = a
-                .iter()
-                .zip(b.iter())
-                .filter(|(a, _)| (0.1..0.9).contains(*a));
-            let (n, sum) = middle.fold((0.0, 0.0), |(n, s), (a, b)| {
-                (n + 1.0, s + f64::from(a - b).powi(2))
-            });
-            (sum / n).sqrt() * 255.0
-        };
-        assert!((power(&clean.left, &noisy.left) - 2.0).abs() < 0.03);
-        assert!((power(&clean.right, &noisy.right) - 2.0).abs() < 0.03);
-        // Independent in the two images: the difference has twice the variance.
-        let left = clean.left.iter().zip(noisy.left.iter()).map(|(a, b)| b - a);
-        let right = clean
-            .right
-            .iter()
-            .zip(noisy.right.iter())
-            .map(|(a, b)| b - a);
-        let (product, n) = left
-            .zip(right)
-            .fold((0.0, 0.0), |(p, n), (a, b)| (p + f64::from(a * b), n + 1.0));
-        assert!((product / n).abs() * 255.0 * 255.0 < 0.05);
-    }
-
-    #[test]
-    fn options_are_checked_by_name() {
-        let defaults = synth("");
-        assert_eq!(
-            (defaults.len(), defaults.rig().width, defaults.rig().height),
-            (60, 384, 288)
-        );
-        for (spec, named) in [
-            ("sead=1", "sead"),
-            ("frames=0", "frames"),
-            ("frames", "frames"),
-            ("width=7", "width"),
-            ("height=99999", "height"),
-            ("seed=-1", "seed"),
-            ("noise=nan", "noise"),
-        ] {
-            let message = Synth::parse(spec)
-                .err()
-                .map(|e| e.to_string())
-                .unwrap_or_default();
-            assert!(
-                message.contains(&format!("synth:{spec}: ")) && message.contains(named),
-                "{message}"
-            );
-        }
-    }
-}
+mod tests;

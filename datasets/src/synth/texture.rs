@@ -14,12 +14,23 @@ pub(super) fn spline(t: f32) -> [f32; 4] {
     ]
 }
 
+/// `v` less as many whole `period`s as fit. (`f64::rem_euclid` is a slow division of integers' kind,
+/// and this is asked millions of times a frame.)
+pub(super) fn wrapped(v: f64, period: f64) -> f32 {
+    let turns = v / period;
+    let whole = turns as i64;
+    let whole = whole - i64::from(whole as f64 > turns);
+    ((turns - whole as f64) * period) as f32
+}
+
 /// A square image of `C` channels that repeats, with its halvings, for look-ups band-limited to the
 /// area a pixel covers: what one camera sees of a point, the other sees too, and neither aliases.
 pub(super) struct Texture<const C: usize> {
     /// Level k has side `side >> k`.
     levels: Vec<Vec<[f32; C]>>,
     side: usize,
+    /// Whether level 0 is read as a B-spline, for textures of which single texels may be seen.
+    smooth: bool,
 }
 
 /// The part of a texture's plane that a pixel covers.
@@ -31,9 +42,32 @@ pub(super) struct Footprint {
     pub minor: f32,
 }
 
+impl Footprint {
+    /// The area between two steps.
+    pub fn new(a: Vector2<f32>, b: Vector2<f32>) -> Self {
+        let major = if a.norm_squared() > b.norm_squared() {
+            a
+        } else {
+            b
+        };
+        Self {
+            major,
+            minor: a.perp(&b).abs() / major.norm().max(1e-9),
+        }
+    }
+
+    /// The same in other units.
+    pub fn scaled(&self, by: f32) -> Self {
+        Self {
+            major: self.major * by,
+            minor: self.minor * by,
+        }
+    }
+}
+
 impl<const C: usize> Texture<C> {
     /// `side` is a power of two and `image` has its square of values.
-    pub fn new(side: usize, image: Vec<[f32; C]>) -> Self {
+    pub fn new(side: usize, smooth: bool, image: Vec<[f32; C]>) -> Self {
         let mut levels = vec![image];
         let mut half = side / 2;
         while half >= 1 {
@@ -66,7 +100,11 @@ impl<const C: usize> Texture<C> {
             levels.push(coarse);
             half /= 2;
         }
-        Self { levels, side }
+        Self {
+            levels,
+            side,
+            smooth,
+        }
     }
 
     /// The mean over a footprint around `at`, in texels of level 0: up to eight look-ups along the
@@ -89,7 +127,7 @@ impl<const C: usize> Texture<C> {
         sum
     }
 
-    /// Smooth (B-spline) at level 0, where single texels may be seen; bilinear above.
+    /// B-spline at level 0 of smooth textures, else bilinear.
     fn at_level(&self, level: usize, at: Vector2<f32>) -> [f32; C] {
         let side = self.side >> level;
         let image = &self.levels[level];
@@ -102,7 +140,7 @@ impl<const C: usize> Texture<C> {
         let wrap = |v: i32| v as usize & (side - 1);
         let row = |j: i32| &image[wrap(j) * side..][..side];
         let mut sum = [0.0; C];
-        if level == 0 {
+        if level == 0 && self.smooth {
             let (wx, wy) = (spline(tx), spline(ty));
             let columns = [wrap(i - 1), wrap(i), wrap(i + 1), wrap(i + 2)];
             for (k, wy) in wy.into_iter().enumerate() {
@@ -141,7 +179,7 @@ mod tests {
             .map(|i| [((i * 7919) % 101) as f32 / 100.0])
             .collect();
         let mean = image.iter().map(|v| v[0]).sum::<f32>() / image.len() as f32;
-        let texture = Texture::new(64, image);
+        let texture = Texture::new(64, true, image);
         for level in &texture.levels {
             assert!(
                 (level.iter().map(|v| v[0]).sum::<f32>() / level.len() as f32 - mean).abs() < 1e-4
@@ -159,6 +197,7 @@ mod tests {
         let wave = |x: f32| (x * std::f32::consts::TAU / 128.0).sin();
         let texture = Texture::new(
             128,
+            true,
             (0..128 * 128).map(|i| [wave((i % 128) as f32)]).collect(),
         );
         for (x, width) in [(10.3, 0.5), (10.3, 2.0), (77.7, 4.0), (-31.0, 6.0)] {

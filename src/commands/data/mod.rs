@@ -1,10 +1,11 @@
 mod check;
 mod info;
+mod synth;
 
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
-use barchan_datasets::{load_rig, open, write_folder};
+use barchan_datasets::{StereoSource, load_rig, open, write_folder};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
 
@@ -47,14 +48,7 @@ enum What {
         #[arg(long, value_name = "FILE.toml")]
         out: PathBuf,
     },
-    /// Write a rendered traverse (or any other data) in `folder` layout
-    Synth {
-        /// What to render: synth:seed=N,frames=N[,width=W,height=H]
-        data: String,
-        /// The directory that is written
-        #[arg(long, value_name = "DIR")]
-        out: PathBuf,
-    },
+    Synth(synth::Args),
 }
 
 #[derive(Serialize)]
@@ -68,27 +62,30 @@ pub fn run(args: Args, output: &Output) -> Result<bool> {
     match args.what {
         What::Info(args) => info::run(args, output)?,
         What::Check(args) => return check::run(args, output),
-        What::Rectify { data, out } => write(&data, out, "rectify", output)?,
-        What::Synth { data, out } => write(&data, out, "render", output)?,
+        What::Rectify { data, out } => rectify(&data, out, output)?,
+        What::Synth(args) => synth::run(args, output)?,
         What::Rig { files, out } => import_rig(&files, out, output)?,
     }
     Ok(true)
 }
 
-fn write(data: &str, out: PathBuf, verb: &str, output: &Output) -> Result<()> {
+fn rectify(data: &str, out: PathBuf, output: &Output) -> Result<()> {
     let source = open(data)?;
-    let bar = output.progress(verb, source.len());
+    let bar = output.progress("rectify", source.len());
     write_folder(source.as_ref(), &out, |done| bar.set_position(done as u64))?;
     bar.finish_and_clear();
-    let rig = source.rig();
+    written(source.as_ref(), out, "", output)
+}
+
+/// Says what a folder holds now.
+fn written(source: &dyn StereoSource, out: PathBuf, more: &str, output: &Output) -> Result<()> {
+    let (rig, frames) = (source.rig(), source.len());
     let text = format!(
-        "{} pairs of {} x {} in {}: left/ right/ rig.toml times.txt, and truth where it is known",
-        source.len(),
+        "{frames} pairs of {} x {} in {}: left/ right/ rig.toml times.txt, and truth where it is known{more}",
         rig.width,
         rig.height,
         out.display()
     );
-    let frames = source.len();
     output.result(&Written { frames, out }, &text)
 }
 

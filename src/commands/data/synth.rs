@@ -1,0 +1,96 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use barchan_datasets::{StereoSource, Synth, open, synth, write_folder, write_synth};
+use barchan_terrain::{Grid, Raster};
+use clap::Parser;
+
+use super::written;
+use crate::output::Output;
+
+/// Write a rendered traverse (or any other data) in `folder` layout
+#[derive(Parser)]
+#[command(after_help = format!("Examples:\n  \
+    barchan data synth synth:seed=1,frames=40 --out data\n  \
+    barchan data synth synth:route=survey,look=moon,frames=300 --out survey\n  \
+    barchan data synth synth:dem=yard.tif,frames=100 --out yard\n  \
+    barchan data synth synth:scenes,seed=1,frames=1000,width=256,height=192 --out shapes\n\n\
+    Options after synth:, by commas\n{}", synth::OPTIONS))]
+pub struct Args {
+    /// What to render: synth:seed=N,frames=N,... as below
+    data: String,
+    /// The directory that is written
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub fn run(args: Args, output: &Output) -> Result<()> {
+    let Args { data, out } = args;
+    let traverse = match data.strip_prefix("synth") {
+        Some("") => Some(""),
+        Some(rest) => rest
+            .strip_prefix(':')
+            .filter(|rest| rest.split(',').next() != Some("scenes")),
+        None => None,
+    };
+    let Some(options) = traverse else {
+        let source = open(&data)?;
+        let bar = output.progress("render", source.len());
+        write_folder(source.as_ref(), &out, |done| bar.set_position(done as u64))?;
+        bar.finish_and_clear();
+        return written(source.as_ref(), out, "", output);
+    };
+    let traverse = Synth::parse(options)?;
+    let bar = output.progress("render", traverse.len());
+    write_synth(&traverse, &out, |done| bar.set_position(done as u64))?;
+    bar.finish_and_clear();
+    write_ground(&traverse, &out.join("dem.tif"))?;
+    written(&traverse, out, ", the ground as dem.tif", output)
+}
+
+/// The true ground, rocks and all, around the drive.
+fn write_ground(traverse: &Synth, path: &Path) -> Result<()> {
+    /// Metres around the drive.
+    const AROUND: f64 = 8.0;
+    /// Most cells along a side; larger ground has larger cells.
+    const MOST: f64 = 2000.0;
+    let Some(truth) = traverse.true_trajectory() else {
+        return Ok(());
+    };
+    let (mut low, mut high) = ([f64::MAX; 2], [f64::MIN; 2]);
+    for pose in &truth.poses {
+        let at = pose.T_world_cam.translation.vector;
+        for (axis, value) in [at.x, at.y].into_iter().enumerate() {
+            low[axis] = low[axis].min(value - AROUND);
+            high[axis] = high[axis].max(value + AROUND);
+        }
+    }
+    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    // Whole centimetres, and the borders on whole cells.
+    let cell = (extent / MOST * 100.0).ceil().max(2.0) / 100.0;
+    let (west, north) = (
+        (low[0] / cell).floor() * cell,
+        (high[1] / cell).ceil() * cell,
+    );
+    let grid = Grid {
+        width: ((high[0] - west) / cell).ceil() as usize,
+        height: ((north - low[1]) / cell).ceil() as usize,
+        west,
+        north,
+        cell_x: cell,
+        cell_y: cell,
+    };
+    let cells = (0..grid.height).flat_map(|row| (0..grid.width).map(move |column| (column, row)));
+    let height = |(column, row)| {
+        let (x, y) = grid.centre(column, row);
+        traverse.ground_height(x, y) as f32
+    };
+    let raster = Raster {
+        values: cells.map(height).collect(),
+        crs: None,
+        grid,
+    };
+    raster
+        .write(path)
+        .with_context(|| path.display().to_string())
+}
