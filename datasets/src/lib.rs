@@ -23,6 +23,7 @@ mod open;
 mod pairs;
 mod prefetch;
 mod resample;
+mod sensor_files;
 mod sensors;
 mod source;
 pub mod synth;

@@ -22,6 +22,22 @@ pub(crate) fn read_times(path: &Path) -> Result<Vec<f64>, DataError> {
 /// # Errors
 /// When the file cannot be read, a column is missing, or a cell is no number.
 pub fn read_planar(path: &Path) -> Result<Trajectory, DataError> {
+    let rows = read_columns(path, ["time", "x", "y"])?;
+    let pose = |[time, x, y]: [f64; 3]| StampedPose {
+        time,
+        T_world_cam: Se3::translation(x, y, 0.0),
+    };
+    Ok(Trajectory {
+        poses: rows.into_iter().map(pose).collect(),
+    })
+}
+
+/// The named columns of a table: a header, then numbers separated by commas. Other columns are
+/// passed over.
+pub(crate) fn read_columns<const N: usize>(
+    path: &Path,
+    names: [&str; N],
+) -> Result<Vec<[f64; N]>, DataError> {
     let text = std::fs::read_to_string(path).map_err(DataError::io(path))?;
     let mut lines = text
         .lines()
@@ -31,27 +47,29 @@ pub fn read_planar(path: &Path) -> Result<Trajectory, DataError> {
         .next()
         .map(|(_, l)| l.split(',').map(str::trim).collect())
         .unwrap_or_default();
-    let column = |name: &str| {
-        let message = || format!("the header has no column \"{name}\"; expected time,x,y");
-        header
+    let mut columns = [0; N];
+    for (column, name) in columns.iter_mut().zip(names) {
+        let message = || {
+            format!(
+                "the header has no column \"{name}\"; expected {}",
+                names.join(",")
+            )
+        };
+        *column = header
             .iter()
             .position(|h| *h == name)
-            .ok_or_else(|| DataError::file(path, message()))
-    };
-    let columns = [column("time")?, column("x")?, column("y")?];
-    let mut poses = Vec::new();
+            .ok_or_else(|| DataError::file(path, message()))?;
+    }
+    let mut rows = Vec::new();
     for (i, line) in lines {
         let cells: Vec<&str> = line.split(',').collect();
-        let mut row = [0.0; 3];
+        let mut row = [0.0; N];
         for (value, column) in row.iter_mut().zip(columns) {
             *value = number(path, i, cells.get(column).unwrap_or(&"nothing"))?;
         }
-        poses.push(StampedPose {
-            time: row[0],
-            T_world_cam: Se3::translation(row[1], row[2], 0.0),
-        });
+        rows.push(row);
     }
-    Ok(Trajectory { poses })
+    Ok(rows)
 }
 
 /// A finite number on line `line`, counted from 0.

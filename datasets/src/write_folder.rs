@@ -1,9 +1,10 @@
 use std::path::Path;
 
-use barchan_geometry::{Rig, StampedPose, Trajectory};
+use barchan_geometry::{Rig, Trajectory};
 
 use crate::image_file::{encode_png, write_whole};
-use crate::{DataError, Plane, Rgb, Sensors, StereoFrame, StereoSource, Synth, disparity_file};
+use crate::sensor_files::write_sensors;
+use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource, Synth, disparity_file};
 
 /// Writes a source in the layout of format `folder`: `left/` and `right/` as 8-bit PNG,
 /// `rig.toml`, `times.txt`, and truth where the source has it: `groundtruth.tum`, `disparity/` and
@@ -198,41 +199,6 @@ fn write_files(
     source
         .sensors()
         .map_or(Ok(()), |sensors| write_sensors(dir, sensors))
-}
-
-/// One file a stream: a header, then a sample a line, in SI units.
-fn write_sensors(dir: &Path, sensors: &Sensors) -> Result<(), DataError> {
-    let row = |time: f64, values: &[f64]| {
-        let values: Vec<String> = values.iter().map(f64::to_string).collect();
-        format!("{time},{}\n", values.join(","))
-    };
-    let imu = sensors.imu.iter().map(|s| {
-        let (a, w) = (s.acceleration, s.rate);
-        row(s.time, &[a.x, a.y, a.z, w.x, w.y, w.z])
-    });
-    let odometry = sensors.odometry.iter();
-    let odometry = odometry.map(|s| row(s.time, &[s.speed, s.yaw_rate]));
-    let gnss = sensors.gnss.iter().map(|s| {
-        let (p, e) = (s.p_world, s.sigma);
-        row(s.time, &[p.x, p.y, p.z, e.x, e.y, e.z])
-    });
-    let tables: [(&str, &str, String); 3] = [
-        ("imu.csv", "time,ax,ay,az,wx,wy,wz\n", imu.collect()),
-        ("odometry.csv", "time,speed,yaw_rate\n", odometry.collect()),
-        ("gnss.csv", "time,x,y,z,sx,sy,sz\n", gnss.collect()),
-    ];
-    for (name, header, rows) in tables {
-        if !rows.is_empty() {
-            write_whole(&dir.join(name), format!("{header}{rows}").as_bytes())?;
-        }
-    }
-    let pose = Trajectory {
-        poses: vec![StampedPose {
-            time: 0.0,
-            T_world_cam: sensors.T_imu_cam,
-        }],
-    };
-    write_whole(&dir.join("imu.tum"), pose.to_tum().as_bytes())
 }
 
 /// Writes 1 as 255 and everything else as 0.

@@ -9,6 +9,7 @@ use crate::calibration::{find_calibration, load_rig_of_size};
 use crate::image_file::image_size;
 use crate::listing::{DISPARITIES, IMAGES, list, pair_up};
 use crate::pairs::{Calibrated, Coding, Pair, PairSource, TrueDisparity};
+use crate::sensor_files::read_sensors;
 use crate::text::{read_planar, read_times};
 
 /// Format `folder`: the user's own images.
@@ -19,7 +20,8 @@ use crate::text::{read_planar, read_times};
 /// (`rig.toml` wins; without any, the error lists the names). When present: `times.txt`
 /// (seconds, one a line); truth in `poses.txt` (KITTI rows), `groundtruth.tum` or `gt.csv`
 /// (`time,x,y[,...]`, planar); `disparity/` (16-bit PNG or PFM by the stems of `left/`, of the
-/// rectified left image) and `disparity_right/` (the same of the right image).
+/// rectified left image) and `disparity_right/` (the same of the right image); `imu.csv`,
+/// `odometry.csv` and `gnss.csv` with `imu.tum`.
 ///
 /// Images of an unrectified rig are rectified on reading, and truth moves with the left camera.
 pub struct Folder;
@@ -96,7 +98,9 @@ impl Folder {
             calibrated: calibrated.clone(),
         };
         let pairs = images.into_iter().zip(times).map(pair).collect();
-        Ok(PairSource::new(dir, pairs)?.with_truth(truth))
+        Ok(PairSource::new(dir, pairs)?
+            .with_truth(truth)
+            .with_sensors(read_sensors(dir)?))
     }
 }
 
