@@ -178,3 +178,26 @@ fn a_run_is_not_overwritten() {
         before
     );
 }
+
+#[test]
+fn a_matcher_with_no_range() {
+    let case = Case::new();
+    for model in ["sgm:x", "sgm:0", "bm:99999"] {
+        let (data, out) = (text(&case.data), case.out());
+        let args = [
+            "infer",
+            "--data",
+            data,
+            "--model",
+            model,
+            "--out",
+            text(&out),
+        ];
+        let message = refused(&args);
+        assert!(
+            message.contains(model) && message.contains("1 to 2048"),
+            "{message}"
+        );
+        assert!(!out.exists());
+    }
+}

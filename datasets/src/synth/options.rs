@@ -10,7 +10,7 @@ frames=60         how many pairs
 width=384 height=288   image size, pixels
 baseline=0.12     metres between the cameras
 look=mars         mars, moon, arena or devon: colours, light and sky of a place
-texture=rich      rich, real (as hard as real sand) or low: contrast of the grain
+texture=rich      rich, real (with noise=2,blur=0.03 as hard as real sand) or low: contrast of the grain
 dem=PATH          a GeoTIFF of heights in metres is the ground (no commas in PATH)
 rocks=0.05        share of the ground under rocks (arena: 0.015; 0 with dem)
 craters=1         how many craters, times the usual number
