@@ -28,15 +28,18 @@ pub fn open_checked(
     }
     let report = check(source.as_ref())?;
     for finding in &report.findings {
-        match finding.fault {
+        let done = match finding.fault {
             Fault::Swapped | Fault::Slipped => bail!(
                 "{spec}: {finding}\n  cure: `barchan data check {spec} --fix` writes the correction beside the images; --no-check takes them as they are"
             ),
-            Fault::RowOffset | Fault::Pitch | Fault::Yaw | Fault::Roll | Fault::Scale => {
-                output.notice(&format!("{spec}: {finding}; rows are corrected"));
+            Fault::RowOffset | Fault::Pitch | Fault::Roll | Fault::Scale
+                if report.correction.is_some() =>
+            {
+                "; rows are corrected"
             }
-            _ => output.notice(&format!("{spec}: {finding}")),
-        }
+            _ => "",
+        };
+        output.notice(&format!("{spec}: {finding}{done}"));
     }
     match report.correction {
         Some(correction) => Ok(Box::new(Corrected::new(source, correction)?)),

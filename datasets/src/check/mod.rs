@@ -170,6 +170,9 @@ pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
         poses.judge(source.rig(), &mut findings);
     }
 
+    // One homography mends one rig.
+    let one_rig = looks.iter().all(|look| look.rig == *source.rig());
+    let rows_need_correction = rows_need_correction && one_rig;
     let correction = (rows_need_correction || swapped || pairing.lag != 0).then(|| Correction {
         swapped,
         right_frame_shift: pairing.lag as i64,
