@@ -159,3 +159,46 @@ fn the_calibration_of_another_tool_becomes_a_rig() {
     ]);
     assert!(message.contains("absent.yaml"), "{message}");
 }
+
+#[test]
+fn synth_writes_a_traverse_with_its_ground_or_random_scenes() {
+    let dir = tempfile::tempdir().unwrap();
+    let (drive, shapes) = (dir.path().join("drive"), dir.path().join("shapes"));
+    let spec = "synth:seed=4,frames=2,width=96,height=64";
+    json(&["data", "synth", spec, "--out", text(&drive)]);
+    for name in [
+        "left/000001.png",
+        "disparity_right/000001.png",
+        "occlusion/000001.png",
+        "rocks.csv",
+        "imu.csv",
+        "dem.tif",
+    ] {
+        assert!(drive.join(name).is_file(), "{name}");
+    }
+    let hillshade = dir.path().join("hillshade.tif");
+    barchan()
+        .args(["raster", "hillshade", text(&drive.join("dem.tif"))])
+        .args(["--out", text(&hillshade)])
+        .assert()
+        .success();
+    json(&[
+        "data",
+        "synth",
+        spec,
+        "--random-scenes",
+        "--out",
+        text(&shapes),
+    ]);
+    assert!(shapes.join("disparity/000001.png").is_file());
+    assert!(!shapes.join("dem.tif").exists());
+    let message = refused(&[
+        "data",
+        "synth",
+        text(&drive),
+        "--random-scenes",
+        "--out",
+        "x",
+    ]);
+    assert!(message.contains("--random-scenes"), "{message}");
+}

@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use barchan_datasets::{StereoSource, Synth, open, synth, write_folder, write_synth};
 use barchan_terrain::{Grid, Raster};
 use clap::Parser;
@@ -14,25 +14,38 @@ use crate::output::Output;
     barchan data synth synth:seed=1,frames=40 --out data\n  \
     barchan data synth synth:route=survey,look=moon,frames=300 --out survey\n  \
     barchan data synth synth:dem=yard.tif,frames=100 --out yard\n  \
-    barchan data synth synth:scenes,seed=1,frames=1000,width=256,height=192 --out shapes\n\n\
+    barchan data synth synth:frames=1000,width=256,height=192 --random-scenes --out shapes\n\n\
     Options after synth:, by commas\n{}", synth::OPTIONS))]
 pub struct Args {
     /// What to render: synth:seed=N,frames=N,... as below
     data: String,
+    /// Random shapes for pretraining instead of a traverse, as synth:scenes,... gives any command
+    #[arg(long)]
+    random_scenes: bool,
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let Args { data, out } = args;
-    let traverse = match data.strip_prefix("synth") {
-        Some("") => Some(""),
-        Some(rest) => rest
-            .strip_prefix(':')
-            .filter(|rest| rest.split(',').next() != Some("scenes")),
-        None => None,
+    let Args {
+        data,
+        random_scenes,
+        out,
+    } = args;
+    let options = match data.as_str() {
+        "synth" => Some(""),
+        other => other.strip_prefix("synth:"),
     };
+    let scenes = options.is_some_and(|options| options.split(',').next() == Some("scenes"));
+    let data = match options {
+        Some(options) if random_scenes && !scenes => format!("synth:scenes,{options}"),
+        None if random_scenes => {
+            bail!("{data}: --random-scenes goes with synth:seed=N,frames=N,...")
+        }
+        _ => data.clone(),
+    };
+    let traverse = options.filter(|_| !scenes && !random_scenes);
     let Some(options) = traverse else {
         let source = open(&data)?;
         let bar = output.progress("render", source.len());
