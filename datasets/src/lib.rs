@@ -1,7 +1,7 @@
 //! Stereo sequences from disk or rendered: one file per format.
 //!
 //! What it is for: a [`StereoSource`] yields rectified [`StereoFrame`]s and, when it has it, truth.
-//! [`open`] finds the format ([`formats()`] lists them); [`load_rig`] reads the calibration of other
+//! [`open`] finds the format; [`load_rig`] reads the calibration of other
 //! tools; [`check`](mod@check) says whether the pairs are fit for stereo, and a [`Correction`] mends
 //! them; [`prefetch`] reads ahead on threads; [`disparity_file`] reads and writes disparity images;
 //! [`write_folder`] writes any source as images on disk.
@@ -30,16 +30,16 @@ pub mod synth;
 mod text;
 mod write_folder;
 
-pub use calibration::{CALIBRATIONS, load_rig, load_rig_of_size};
+pub use calibration::load_rig;
 pub use correction::{Corrected, Correction};
 pub use error::DataError;
 pub use formats::folder::Folder;
 pub use image_file::read_rgb;
-pub use open::{dataset_folder, formats, open, open_as_stored};
+pub use open::{dataset_folder, open, open_as_stored};
 pub use pairs::PairSource;
 pub use prefetch::{Prefetch, prefetch};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
-pub use synth::{RandomScenes, Synth};
+pub use synth::Synth;
 pub use text::read_planar;
 pub use write_folder::{write_folder, write_synth};

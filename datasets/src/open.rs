@@ -6,8 +6,8 @@ use crate::{Corrected, Correction, DataError, StereoSource, synth};
 /// How to write a rendered traverse.
 const SYNTH: &str = "synth:seed=1,frames=60";
 
-/// What [`open`] understands, for help texts: how it is written, and what is looked for.
-pub fn formats() -> Vec<(String, &'static str)> {
+/// What [`open`] understands: how it is written, and what is looked for.
+fn formats() -> Vec<(String, &'static str)> {
     let on_disk = ON_DISK
         .iter()
         .map(|f| (format!("{}:PATH", f.name), f.layout));

@@ -313,7 +313,8 @@ fn positions(poses: &[Se3]) -> Vec<Vector3<f64>> {
     poses.iter().map(|p| p.translation.vector).collect()
 }
 
-fn path_length(points: &[Vector3<f64>]) -> f64 {
+/// Length of the way from point to point, in the unit of the points.
+pub fn path_length(points: &[Vector3<f64>]) -> f64 {
     points.windows(2).map(|w| (w[1] - w[0]).norm()).sum()
 }
 

@@ -118,15 +118,21 @@ fn a_jump_is_bridged_or_admitted_but_never_hidden() {
 
 #[test]
 fn a_rendered_traverse() {
-    let source = open("synth:seed=4,frames=30").unwrap();
-    let (reports, result) = track(slam(source.as_ref()), frames(source.as_ref()));
-    assert_eq!(tracked(&reports), 30);
-    assert_eq!(result.trajectory.poses.len(), 30);
-    // A thousandth of the path; alignment to a fraction of a pixel is worth a factor of three.
-    let score = score_of(&result, source.as_ref());
-    assert!(score.ate_rmse <= 0.001 * score.length, "{score:?}");
-    // Of five seeds 0.3 to 0.7: the steps are short, and rocks hide and show ground.
-    assert!(score.rpe_trans_percent <= 0.7, "{score:?}");
+    let seeds = [3, 4, 5];
+    let mut step_errors = 0.0;
+    for seed in seeds {
+        let source = open(&format!("synth:seed={seed},frames=30")).unwrap();
+        let (reports, result) = track(slam(source.as_ref()), frames(source.as_ref()));
+        assert_eq!(tracked(&reports), 30);
+        assert_eq!(result.trajectory.poses.len(), 30);
+        // A thousandth of the path; alignment to a fraction of a pixel is worth a factor of three.
+        let score = score_of(&result, source.as_ref());
+        assert!(score.ate_rmse <= 0.001 * score.length, "{seed}: {score:?}");
+        step_errors += score.rpe_trans_percent;
+    }
+    // Steps are short, and one ground is harder than another: their mean.
+    let mean = step_errors / seeds.len() as f64;
+    assert!(mean <= 0.6, "{mean} %");
 }
 
 #[test]

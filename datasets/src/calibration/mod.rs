@@ -19,7 +19,7 @@ pub(crate) use kitti::read_projections;
 pub(crate) use middlebury::read_middlebury;
 
 /// What [`load_rig`] reads, for help texts.
-pub const CALIBRATIONS: &[&str] = &[
+const CALIBRATIONS: &[&str] = &[
     "rig.toml",
     "KITTI calib.txt or calib_cam_to_cam.txt",
     "Middlebury calib.txt",
@@ -86,7 +86,7 @@ pub(crate) fn find_calibration(dir: &Path) -> Result<Vec<PathBuf>, DataError> {
 ///
 /// # Errors
 /// When a file is missing, is none of these, lacks a value, or holds one that no rig has. Where
-/// the files do not tell the size of the images, see [`load_rig_of_size`].
+/// the files do not tell the size of the images.
 pub fn load_rig(paths: &[PathBuf]) -> Result<Rig, DataError> {
     load_rig_of_size(paths, None)
 }
@@ -96,7 +96,10 @@ pub fn load_rig(paths: &[PathBuf]) -> Result<Rig, DataError> {
 ///
 /// # Errors
 /// As [`load_rig`].
-pub fn load_rig_of_size(paths: &[PathBuf], size: Option<(usize, usize)>) -> Result<Rig, DataError> {
+pub(crate) fn load_rig_of_size(
+    paths: &[PathBuf],
+    size: Option<(usize, usize)>,
+) -> Result<Rig, DataError> {
     let (first, second) = match paths {
         [one] => (one, None),
         [first, second] => (first, Some(second)),

@@ -112,13 +112,6 @@ impl Report {
     }
 }
 
-/// How left and right images go together.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Pairing {
-    /// The left image of frame `i` belongs to the right image of frame `i + lag`.
-    lag: isize,
-}
-
 /// Frames looked at.
 const FRAMES: usize = 12;
 /// Patches tried over all frames.
@@ -136,16 +129,17 @@ const HARMLESS: f64 = 0.5;
 /// When a frame cannot be read.
 pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
     let frames = spread(source.len(), FRAMES);
-    let mut pairing = Pairing { lag: 0 };
-    let mut looks = look(source, &frames, pairing)?;
+    // The left image of frame i belongs to the right image of frame i + lag.
+    let mut lag = 0;
+    let mut looks = look(source, &frames, lag)?;
     let mut rows = RowModel::fit(&row_matches(&looks));
 
     // Rows that no rig explains: perhaps the images are not of one moment.
     let consistency = |rows: &Option<RowModel>| rows.as_ref().map_or(0.0, RowModel::consistency);
     if consistency(&rows) < 0.9 && source.len() > 1 {
-        pairing = find_slip(source)?;
-        if pairing.lag != 0 {
-            looks = look(source, &frames, pairing)?;
+        lag = find_slip(source)?;
+        if lag != 0 {
+            looks = look(source, &frames, lag)?;
             rows = RowModel::fit(&row_matches(&looks));
         }
     }
@@ -153,7 +147,7 @@ pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
     // Pairs that do not fit together, and a keystone, which may be a yaw that shifts every disparity,
     // leave nothing to compare poses with.
     let keystone = rows.is_some_and(|rows| rows.yaw != 0.0);
-    let poses = if swapped || pairing.lag != 0 || keystone {
+    let poses = if swapped || lag != 0 || keystone {
         None
     } else {
         poses::pose_scale(source, &looks, rows.as_ref())?
@@ -161,7 +155,7 @@ pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
 
     let mut findings = Vec::new();
     judge_matches(&looks, rows.as_ref(), &mut findings);
-    judge_pairing(pairing, swapped, &mut findings);
+    judge_pairing(lag, swapped, &mut findings);
     let rows_need_correction = judge_rows(source.rig(), rows.as_ref(), &mut findings);
     let gain = judge_exposure(&looks, &mut findings);
     let photometry: Vec<&Photometry> = looks.iter().map(|look| &look.photometry).collect();
@@ -173,9 +167,9 @@ pub fn check(source: &dyn StereoSource) -> Result<Report, DataError> {
     // One homography mends one rig.
     let one_rig = looks.iter().all(|look| look.rig == *source.rig());
     let rows_need_correction = rows_need_correction && one_rig;
-    let correction = (rows_need_correction || swapped || pairing.lag != 0).then(|| Correction {
+    let correction = (rows_need_correction || swapped || lag != 0).then(|| Correction {
         swapped,
-        right_frame_shift: pairing.lag as i64,
+        right_frame_shift: lag as i64,
         right_homography: match &rows {
             Some(rows) if rows_need_correction => rows.homography(source.rig()),
             _ => Matrix3::identity(),
@@ -210,16 +204,12 @@ fn spread(len: usize, count: usize) -> Vec<usize> {
 }
 
 /// Matches the given frames, those whose partner exists.
-fn look(
-    source: &dyn StereoSource,
-    frames: &[usize],
-    pairing: Pairing,
-) -> Result<Vec<Look>, DataError> {
+fn look(source: &dyn StereoSource, frames: &[usize], lag: isize) -> Result<Vec<Look>, DataError> {
     let patches = PATCHES / frames.len().max(1);
     frames
         .par_iter()
         .filter_map(|&i| {
-            let partner = i.checked_add_signed(pairing.lag)?;
+            let partner = i.checked_add_signed(lag)?;
             (partner < source.len()).then_some((i, partner))
         })
         .map(|(i, partner)| {
@@ -270,7 +260,7 @@ fn row_matches(looks: &[Look]) -> Vec<RowMatch> {
 
 /// The shift between left and right images at which most matches agree on one rig, looked for in
 /// three stretches of the sequence.
-fn find_slip(source: &dyn StereoSource) -> Result<Pairing, DataError> {
+fn find_slip(source: &dyn StereoSource) -> Result<isize, DataError> {
     let len = source.len() as isize;
     let middles = spread(source.len(), 4).into_iter().skip(1);
     let mut by_lag: Vec<Vec<RowMatch>> = vec![Vec::new(); 2 * LAGS as usize + 1];
@@ -315,9 +305,7 @@ fn find_slip(source: &dyn StereoSource) -> Result<Pairing, DataError> {
         .unwrap_or(LAGS as usize);
     // A rover that hardly moves agrees at every lag: then the images as they are come first.
     let better = explained[best] > 1.25 * now + 5.0;
-    Ok(Pairing {
-        lag: if better { best as isize - LAGS } else { 0 },
-    })
+    Ok(if better { best as isize - LAGS } else { 0 })
 }
 
 /// Whether what is seen lies behind the cameras: most disparities negative.
@@ -391,7 +379,7 @@ fn judge_matches(looks: &[Look], rows: Option<&RowModel>, findings: &mut Vec<Fin
     }
 }
 
-fn judge_pairing(pairing: Pairing, swapped: bool, findings: &mut Vec<Finding>) {
+fn judge_pairing(lag: isize, swapped: bool, findings: &mut Vec<Finding>) {
     if swapped {
         findings.push(Finding {
             fault: Fault::Swapped,
@@ -399,18 +387,15 @@ fn judge_pairing(pairing: Pairing, swapped: bool, findings: &mut Vec<Finding>) {
             text: "left and right are swapped: what is nearer lies further to the right in the right images".into(),
         });
     }
-    if pairing.lag != 0 {
-        let (frames, when) = (
-            pairing.lag.unsigned_abs(),
-            if pairing.lag > 0 { "late" } else { "early" },
-        );
+    if lag != 0 {
+        let (frames, when) = (lag.unsigned_abs(), if lag > 0 { "late" } else { "early" });
         findings.push(Finding {
             fault: Fault::Slipped,
-            value: pairing.lag as f64,
+            value: lag as f64,
             text: format!(
                 "the right images come {frames} frame{} too {when}: left image i belongs to right image i{:+}",
                 if frames == 1 { "" } else { "s" },
-                pairing.lag
+                lag
             ),
         });
     }

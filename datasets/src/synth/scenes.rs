@@ -11,6 +11,7 @@ use super::noise::add_noise;
 use super::options::Options;
 use super::render::{self, Look, Scene, View};
 use super::rocks::Rock;
+use super::straight_rig;
 use super::surface::Hit;
 use super::texture::{Footprint, Texture, wrapped};
 use crate::pairs::no_frame;
@@ -35,17 +36,7 @@ impl RandomScenes {
     /// When an option is unknown or out of range; the message names it.
     pub fn parse(spec: &str) -> Result<Self, DataError> {
         let options = Options::parse(spec, true)?;
-        let focal = 0.8 * options.width as f64;
-        let rig = RectifiedRig {
-            width: options.width,
-            height: options.height,
-            fx: focal,
-            fy: focal,
-            cx: (options.width as f64 - 1.0) / 2.0,
-            cy: (options.height as f64 - 1.0) / 2.0,
-            doffs: 0.0,
-            baseline: options.baseline,
-        };
+        let rig = straight_rig(&options);
         let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
         rng.set_stream(u64::MAX);
         let seeds: Vec<u32> = (0..16).map(|_| rng.random()).collect();

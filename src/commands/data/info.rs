@@ -3,7 +3,8 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use barchan_datasets::check::{Report, check};
 use barchan_datasets::{Plane, StereoFrame, StereoSource, open};
-use barchan_geometry::RectifiedRig;
+use barchan_eval::trajectory::path_length;
+use barchan_geometry::{RectifiedRig, StampedPose};
 use clap::Parser;
 use serde::Serialize;
 
@@ -95,14 +96,8 @@ fn summary(
         times,
         true_disparity: rows.iter().any(|(_, truth)| truth.is_some()),
         true_path: source.true_trajectory().map(|truth| {
-            truth
-                .poses
-                .windows(2)
-                .map(|w| {
-                    let (a, b) = (w[0].T_world_cam, w[1].T_world_cam);
-                    (b.translation.vector - a.translation.vector).norm()
-                })
-                .sum()
+            let position = |pose: &StampedPose| pose.T_world_cam.translation.vector;
+            path_length(&truth.poses.iter().map(position).collect::<Vec<_>>())
         }),
         imu_samples: sensors.map_or(0, |s| s.imu.len()),
         odometry_samples: sensors.map_or(0, |s| s.odometry.len()),
