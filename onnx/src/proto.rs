@@ -1,4 +1,5 @@
-//! The messages of `onnx.proto` (IR version 8) that are written here, with their field numbers.
+//! The messages of `onnx.proto` (IR version 8) that are used here, with their field numbers.
+#![allow(missing_docs)] // The fields are those of `onnx.proto`, which documents them.
 
 use prost::Message;
 
