@@ -6,18 +6,25 @@ use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
 
 #[test]
-fn burn_and_onnx_runtime_agree_at_five_sizes() {
+fn burn_and_onnx_runtime_agree_at_five_sizes_on_every_preset() {
     let runtime = match Runtime::load(None) {
         Ok(runtime) => runtime,
         Err(error) => panic!("`make test` installs ONNX Runtime first: {error}"),
     };
+    for preset in Preset::ALL {
+        agree(&runtime, preset);
+    }
+}
+
+fn agree(runtime: &Runtime, preset: Preset) {
+    let name = preset.name();
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("net.onnx");
     let device = Device::flex();
-    let net = StereoNet::init(&Preset::Tiny.config(), 2, &device).unwrap();
+    let net = StereoNet::init(&preset.config(), 2, &device).unwrap();
     onnx::save(&net, &path).unwrap();
     let mut burn = BurnEngine::new(net, device, "random");
-    let mut ort = OnnxEngine::load(&runtime, &path, 0).unwrap();
+    let mut ort = OnnxEngine::load(runtime, &path, 0).unwrap();
 
     for (width, height) in [(128, 96), (200, 150), (97, 61), (33, 40), (320, 16)] {
         let image = |shift: f32| {
@@ -32,7 +39,7 @@ fn burn_and_onnx_runtime_agree_at_five_sizes() {
             burn.disparity(&left, &right).unwrap(),
             ort.disparity(&left, &right).unwrap(),
         );
-        for (name, a, b, median_bound, max_bound) in [
+        for (what, a, b, median_bound, max_bound) in [
             ("disparity", &a.disparity, &b.disparity, 1e-3, 1e-2),
             ("sigma", &a.sigma, &b.sigma, 1e-2, 5e-2),
             ("confidence", &a.confidence, &b.confidence, 1e-3, 1e-2),
@@ -45,10 +52,10 @@ fn burn_and_onnx_runtime_agree_at_five_sizes() {
                 difference[difference.len() / 2],
                 difference[difference.len() - 1],
             );
-            println!("{width}x{height} {name}: median {median:.1e}, maximum {maximum:.1e}");
+            println!("{name} {width}x{height} {what}: median {median:.1e}, maximum {maximum:.1e}");
             assert!(
                 median <= median_bound && maximum <= max_bound,
-                "{width}x{height} {name}: {median} {maximum}"
+                "{name} {width}x{height} {what}: {median} {maximum}"
             );
         }
     }

@@ -7,21 +7,23 @@
 //! What it promises: one definition, two interpreters. Every block is written once against the
 //! small vocabulary [`Ops`]; Burn executes it and the ONNX writer writes it down, so the exported
 //! graph cannot drift from the trained one. One block, one file; the blocks follow the order of
-//! the data: [`features`], [`volume`], [`aggregation`], [`regression`].
+//! the data: [`features`], [`volume`], [`planar`] or [`volumetric`], [`regression`].
 //!
 //! What it never does: read an image, name a dataset, or know a loss.
 
-pub mod aggregation;
 pub mod features;
 mod net;
 pub mod onnx;
 mod ops;
+pub mod planar;
 pub mod regression;
 pub mod volume;
+pub mod volumetric;
 pub mod weights;
 
-pub use net::{NetConfig, Prediction, Preset, StereoNet};
-pub use ops::{Execute, Kernel, Ops};
+pub use net::{AggregationConfig, NetConfig, Prediction, Preset, StereoNet};
+pub use ops::{Correlated, Execute, Kernel, Ops};
+pub use regression::Argmin;
 
 /// Re-exported so that users of this crate need not name Burn.
 pub use burn::tensor::{Device, Tensor};

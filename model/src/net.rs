@@ -5,11 +5,12 @@ use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
-use crate::aggregation::Aggregation;
 use crate::features::Features;
 use crate::ops::{Execute, Ops};
-use crate::regression::{Regression, SCALE};
-use crate::volume::{CENSUS_CHANNELS, census_volume, correlation_volume};
+use crate::planar::{Planar, PlanarConfig};
+use crate::regression::{Argmin, Regression, SCALE};
+use crate::volume::census_descriptors;
+use crate::volumetric::{Volumetric, VolumetricConfig};
 
 /// Images are padded inside the network to a multiple of this.
 const MULTIPLE: usize = 16;
@@ -18,22 +19,62 @@ const MULTIPLE: usize = 16;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// 0.2 M parameters: trains on a laptop in minutes, every stage of the real network.
+    /// 0.1 M parameters: trains on a laptop in minutes, every stage of `rover`.
     Tiny,
+    /// Real time on two CPU cores.
+    Rover,
+    /// The network of Hong 2021 (3.2.1) after Zhong 2017: accuracy first.
+    Paper,
 }
 
 impl Preset {
+    /// All, smallest first.
+    pub const ALL: [Self; 3] = [Self::Tiny, Self::Rover, Self::Paper];
+
     /// What the preset stands for.
     pub fn config(self) -> NetConfig {
         match self {
             Self::Tiny => NetConfig {
                 max_disparity: 96,
-                features: [16, 24, 40],
-                matching: 16,
-                groups: 4,
-                aggregation: [12, 24, 32],
+                features: [16, 16, 24, 32],
+                aggregation: AggregationConfig::Planar(PlanarConfig {
+                    matching: [16, 16],
+                    groups: [2, 4],
+                    channels: [16, 16],
+                    blocks: [1, 1, 1],
+                }),
+                up_sampling: 16,
+            },
+            Self::Rover => NetConfig {
+                max_disparity: 96,
+                features: [16, 32, 48, 64],
+                aggregation: AggregationConfig::Planar(PlanarConfig {
+                    matching: [32, 48],
+                    groups: [2, 8],
+                    channels: [32, 48],
+                    blocks: [1, 2, 1],
+                }),
                 up_sampling: 32,
             },
+            Self::Paper => NetConfig {
+                max_disparity: 96,
+                features: [32, 32, 64, 96],
+                aggregation: AggregationConfig::Volumetric(VolumetricConfig {
+                    matching: 16,
+                    channels: [24, 32, 48],
+                    census: true,
+                }),
+                up_sampling: 32,
+            },
+        }
+    }
+
+    /// Its name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tiny => "tiny",
+            Self::Rover => "rover",
+            Self::Paper => "paper",
         }
     }
 }
@@ -44,16 +85,22 @@ impl Preset {
 pub struct NetConfig {
     /// Disparities are searched in `0..max_disparity` pixels; a multiple of 16.
     pub max_disparity: usize,
-    /// Channels of the 2-D features at 1/2, 1/4 and 1/8 of the resolution.
-    pub features: [usize; 3],
-    /// Channels of the features that are correlated; a multiple of `groups`.
-    pub matching: usize,
-    /// Groups of the group-wise correlation.
-    pub groups: usize,
-    /// Channels of the 3-D convolutions at 1/4, 1/8 and 1/16.
-    pub aggregation: [usize; 3],
+    /// Channels of the 2-D features at 1/2, 1/4, 1/8 and 1/16 of the resolution.
+    pub features: [usize; 4],
     /// Hidden channels of the up-sampling.
     pub up_sampling: usize,
+    /// How costs become logits.
+    pub aggregation: AggregationConfig,
+}
+
+/// From features to logits over disparities.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AggregationConfig {
+    /// Correlation, 2-D convolutions: fast.
+    Planar(PlanarConfig),
+    /// Concatenation, 3-D convolutions: the paper's.
+    Volumetric(VolumetricConfig),
 }
 
 impl NetConfig {
@@ -69,17 +116,28 @@ impl NetConfig {
         {
             return refuse("max_disparity must be a multiple of 16, at most 1024");
         }
-        let channels = [
-            &self.features[..],
-            &self.aggregation[..],
-            &[self.matching, self.groups, self.up_sampling],
-        ]
-        .concat();
+        let mut channels = self.features.to_vec();
+        channels.push(self.up_sampling);
+        match &self.aggregation {
+            AggregationConfig::Planar(c) => {
+                channels.extend(c.matching.iter().chain(&c.groups).chain(&c.channels));
+                let divides = |level: usize| {
+                    c.groups[level] > 0 && c.matching[level].is_multiple_of(c.groups[level])
+                };
+                if !divides(0) || !divides(1) {
+                    return refuse("matching must be a multiple of groups");
+                }
+                if c.blocks.iter().any(|n| *n > 64) {
+                    return refuse("blocks must be at most 64");
+                }
+            }
+            AggregationConfig::Volumetric(c) => {
+                channels.extend(&c.channels);
+                channels.push(c.matching);
+            }
+        }
         if channels.iter().any(|c| !(1..=1024).contains(c)) {
             return refuse("channels and groups must be 1 to 1024");
-        }
-        if !self.matching.is_multiple_of(self.groups) {
-            return refuse("matching must be a multiple of groups");
         }
         Ok(())
     }
@@ -100,7 +158,7 @@ pub struct Prediction<M> {
     pub confidence: M,
 }
 
-/// Rectified pair in, disparity out: features, cost volume, 3-D convolutions, soft-argmin, learned
+/// Rectified pair in, disparity out: features, cost volume, convolutions over it, soft-argmin, learned
 /// up-sampling (Hong 2021, 3.2.1, after Zhong 2017).
 #[derive(Module, Debug)]
 pub struct StereoNet {
@@ -109,6 +167,14 @@ pub struct StereoNet {
     regression: Regression,
     #[module(skip)]
     config: NetConfig,
+}
+
+/// As [`AggregationConfig`] says.
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant)] // There is one of it.
+enum Aggregation {
+    Planar(Planar),
+    Volumetric(Volumetric),
 }
 
 static DRAWING: Mutex<()> = Mutex::new(());
@@ -132,11 +198,18 @@ impl StereoNet {
         // The device's generator is the process's: nobody else may draw between seed and last draw.
         let _drawing = DRAWING.lock().unwrap_or_else(PoisonError::into_inner);
         device.seed(seed);
-        let input = config.groups + CENSUS_CHANNELS;
+        let [_, quarter, eighth, _] = config.features;
         let net = Self {
-            features: Features::init(config.features, config.matching, device),
-            aggregation: Aggregation::init(input, config.aggregation, device),
-            regression: Regression::init(config.features[1], config.up_sampling, device),
+            features: Features::init(config.features, device),
+            aggregation: match &config.aggregation {
+                AggregationConfig::Planar(c) => {
+                    Aggregation::Planar(Planar::init(c, [quarter, eighth], device))
+                }
+                AggregationConfig::Volumetric(c) => {
+                    Aggregation::Volumetric(Volumetric::init(c, quarter, device))
+                }
+            },
+            regression: Regression::init(quarter, config.up_sampling, device),
             config: config.clone(),
         };
         net.visit(&mut Draw);
@@ -161,41 +234,57 @@ impl StereoNet {
 
     /// Runs on images `[B, 3, H, W]` of any size, RGB in 0..=1.
     pub fn forward(&self, left: Tensor<4>, right: Tensor<4>) -> Prediction<Tensor<4>> {
-        self.run(&mut Execute::on(left.device()), &left, &right)
+        self.run(
+            &mut Execute::on(left.device()),
+            Argmin::AroundPeak,
+            &left,
+            &right,
+        )
+    }
+
+    /// [`StereoNet::forward`] with the mean over all bins, so that every bin gets a gradient.
+    pub fn forward_training(&self, left: Tensor<4>, right: Tensor<4>) -> Prediction<Tensor<4>> {
+        self.run(
+            &mut Execute::on(left.device()),
+            Argmin::Everywhere,
+            &left,
+            &right,
+        )
     }
 
     /// The definition, for whoever interprets it.
-    pub fn run<O: Ops>(&self, ops: &mut O, left: &O::Map, right: &O::Map) -> Prediction<O::Map> {
-        let NetConfig {
-            matching, groups, ..
-        } = self.config;
+    pub fn run<O: Ops>(
+        &self,
+        ops: &mut O,
+        argmin: Argmin,
+        left: &O::Map,
+        right: &O::Map,
+    ) -> Prediction<O::Map> {
         let bins = self.config.bins();
 
-        // Colour cast and exposure, of each camera on its own, go before anything is compared.
-        let prepare = |ops: &mut O, image: &O::Map| {
-            let normal = ops.instance_norm(3, 1e-5, image);
-            ops.pad_to_multiple(MULTIPLE, &normal)
+        // Both images pass the same layers, one after the other in the batch. Colour cast and exposure, of
+        // each camera on its own, go before anything is compared.
+        let images = ops.join(left, right);
+        let images = ops.instance_norm(3, 1e-5, &images);
+        let images = ops.pad_to_multiple(MULTIPLE, &images);
+
+        let features = self.features.forward(ops, &images);
+        let logits = match &self.aggregation {
+            Aggregation::Planar(planar) => {
+                let census = census_descriptors(ops, &images);
+                planar.forward(ops, bins, &features, &census)
+            }
+            Aggregation::Volumetric(volumetric) => {
+                let census = volumetric
+                    .needs_census()
+                    .then(|| census_descriptors(ops, &images));
+                volumetric.forward(ops, bins, &features, census.as_ref())
+            }
         };
-        let (l, r) = (prepare(ops, left), prepare(ops, right));
-
-        let seen_left = self.features.forward(ops, "features", &l);
-        let seen_right = self.features.forward(ops, "features", &r);
-
-        let correlation = correlation_volume(
-            ops,
-            &seen_left.matching,
-            &seen_right.matching,
-            matching,
-            groups,
-            bins,
-        );
-        let census = census_volume(ops, &l, &r, bins);
-        let volume = ops.concat_volumes(&[correlation, census]);
-
-        let logits = self.aggregation.forward(ops, &volume);
+        let (context, _) = ops.halves(&features.quarter);
         let full = self
             .regression
-            .forward(ops, bins, &logits, &seen_left.context);
+            .forward(ops, bins, argmin, &logits, &context);
         Prediction {
             disparity: ops.crop_to(left, &full.disparity),
             sigma: ops.crop_to(left, &full.sigma),

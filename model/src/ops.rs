@@ -1,10 +1,12 @@
 //! The vocabulary that blocks are written in, and its execution by Burn.
 
-use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose2d, ConvTranspose3d};
-use burn::tensor::activation::{relu, softmax};
+use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
+use burn::tensor::activation::{relu, sigmoid};
 use burn::tensor::module::conv2d;
 use burn::tensor::ops::{ConvOptions, PadMode};
 use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::planar::DisparityMix;
 
 /// A convolution kernel that is not learned: `[out, in, height, width]`.
 #[derive(Clone, Debug)]
@@ -33,9 +35,25 @@ impl Kernel {
     }
 }
 
+/// Two maps whose correlation is asked for.
+#[derive(Debug)]
+pub struct Correlated<'a, M> {
+    /// `[batch, channels, height, width]`.
+    pub left: &'a M,
+    /// The same of the right image.
+    pub right: &'a M,
+    /// How many channels there are.
+    pub channels: usize,
+    /// Channels are summed in this many groups, each one channel of the result.
+    pub groups: usize,
+}
+
 /// What a block may ask for. `Map` is `[batch, channel, height, width]`, `Volume` is
 /// `[batch, channel, disparity, height, width]`. Names label ONNX nodes and say which layer of
 /// [`crate::StereoNet`] they come from.
+///
+/// Where bins of disparity are channels, they count slowest: channel `bin * n + c` of `[batch, bins * n,
+/// height, width]`.
 ///
 /// Two-operand arithmetic broadcasts over channels: one operand may have a single channel.
 pub trait Ops {
@@ -46,9 +64,31 @@ pub trait Ops {
 
     /// A learned convolution.
     fn conv2d(&mut self, name: &str, layer: &Conv2d, x: &Self::Map) -> Self::Map;
-    /// A learned transposed convolution.
-    fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &Self::Map)
-    -> Self::Map;
+    /// A learned convolution of each of `bins` equal shares of the channels, the same for all.
+    fn conv2d_per_bin(
+        &mut self,
+        name: &str,
+        layer: &Conv2d,
+        bins: usize,
+        x: &Self::Map,
+    ) -> Self::Map;
+    /// A learned convolution over `bins` at every pixel, zero outside.
+    fn disparity_mix(
+        &mut self,
+        name: &str,
+        layer: &DisparityMix,
+        bins: usize,
+        x: &Self::Map,
+    ) -> Self::Map;
+    /// How well left and right match: sums over a group's channels of `left(x) right(x - d)` for the
+    /// `bins` whole disparities, near to far (`d = bins - 1` first); zero where `x - d` is outside. Channels
+    /// are `bins * (groups of the first, of the second, ...)`.
+    fn correlate(
+        &mut self,
+        name: &str,
+        pairs: &[Correlated<'_, Self::Map>],
+        bins: usize,
+    ) -> Self::Map;
     /// A learned convolution over disparity, height and width.
     fn conv3d(&mut self, name: &str, layer: &Conv3d, x: &Self::Volume) -> Self::Volume;
     /// A learned transposed convolution over disparity, height and width.
@@ -69,6 +109,8 @@ pub trait Ops {
 
     /// `max(x, 0)`.
     fn relu(&mut self, x: &Self::Map) -> Self::Map;
+    /// `1 / (1 + exp(-x))`.
+    fn sigmoid(&mut self, x: &Self::Map) -> Self::Map;
     /// `max(x, 0)`.
     fn relu_volume(&mut self, x: &Self::Volume) -> Self::Volume;
     /// Each channel of each image to zero mean and unit variance.
@@ -93,30 +135,42 @@ pub trait Ops {
     fn abs(&mut self, x: &Self::Map) -> Self::Map;
     /// `x` limited to `low..=high`.
     fn clamp(&mut self, low: f32, high: f32, x: &Self::Map) -> Self::Map;
-    /// Softmax over channels.
-    fn softmax(&mut self, x: &Self::Map) -> Self::Map;
+    /// The largest channel at every pixel; a constant to the gradient.
+    fn channel_max(&mut self, x: &Self::Map) -> Self::Map;
+    /// The number of the largest channel at every pixel.
+    fn channel_argmax(&mut self, x: &Self::Map) -> Self::Map;
     /// One constant a channel, `[1, n, 1, 1]`.
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> Self::Map;
     /// `a + b`.
     fn add_volume(&mut self, a: &Self::Volume, b: &Self::Volume) -> Self::Volume;
 
+    /// One batch after the other.
+    fn join(&mut self, first: &Self::Map, second: &Self::Map) -> Self::Map;
+    /// Undoes [`Ops::join`].
+    fn halves(&mut self, x: &Self::Map) -> (Self::Map, Self::Map);
+    /// All channels, `times` over.
+    fn repeat_channels(&mut self, times: usize, x: &Self::Map) -> Self::Map;
     /// Maps after one another as channels.
     fn concat(&mut self, maps: &[Self::Map]) -> Self::Map;
     /// Volumes after one another as channels.
     fn concat_volumes(&mut self, volumes: &[Self::Volume]) -> Self::Volume;
     /// Maps as the disparities of a volume.
     fn stack(&mut self, maps: &[Self::Map]) -> Self::Volume;
+    /// A map of `bins` bins as a volume.
+    fn as_volume(&mut self, bins: usize, x: &Self::Map) -> Self::Volume;
     /// A volume of one channel as a map whose channels are its disparities.
     fn disparities_as_channels(&mut self, x: &Self::Volume) -> Self::Map;
     /// `out(x) = in(x - by)`; zero where that is outside.
     fn shift_right(&mut self, by: usize, x: &Self::Map) -> Self::Map;
-    /// The border pixels repeated outwards.
-    fn pad_edge(&mut self, by: usize, x: &Self::Map) -> Self::Map;
+    /// The border pixels repeated outwards, `[left, right, top, bottom]` times.
+    fn pad_edge(&mut self, by: [usize; 4], x: &Self::Map) -> Self::Map;
     /// The last row and column repeated until height and width are multiples.
     fn pad_to_multiple(&mut self, multiple: usize, x: &Self::Map) -> Self::Map;
     /// `x` cut to the height and width of `like`.
     fn crop_to(&mut self, like: &Self::Map, x: &Self::Map) -> Self::Map;
-    /// Blocks of `r * r` channels to `r` times the height and width (one channel out).
+    /// Every pixel twice in height and in width.
+    fn double(&mut self, x: &Self::Map) -> Self::Map;
+    /// Every `r * r` channels to one of `r` times the height and width.
     fn depth_to_space(&mut self, r: usize, x: &Self::Map) -> Self::Map;
 }
 
@@ -139,8 +193,42 @@ impl Ops for Execute {
     fn conv2d(&mut self, _: &str, layer: &Conv2d, x: &Tensor<4>) -> Tensor<4> {
         layer.forward(x.clone())
     }
-    fn conv_transpose2d(&mut self, _: &str, layer: &ConvTranspose2d, x: &Tensor<4>) -> Tensor<4> {
-        layer.forward(x.clone())
+    fn conv2d_per_bin(&mut self, _: &str, layer: &Conv2d, bins: usize, x: &Tensor<4>) -> Tensor<4> {
+        let [batch, channels, height, width] = x.dims();
+        let y = layer.forward(
+            x.clone()
+                .reshape([batch * bins, channels / bins, height, width]),
+        );
+        let [_, channels, height, width] = y.dims();
+        y.reshape([batch, bins * channels, height, width])
+    }
+    fn disparity_mix(
+        &mut self,
+        _: &str,
+        layer: &DisparityMix,
+        bins: usize,
+        x: &Tensor<4>,
+    ) -> Tensor<4> {
+        let (weight, bias) = layer.banded(bins);
+        conv2d(
+            x.clone(),
+            weight,
+            Some(bias),
+            ConvOptions::new([1; 2], [0; 2], [1; 2], 1),
+        )
+    }
+    fn correlate(
+        &mut self,
+        _: &str,
+        pairs: &[Correlated<'_, Tensor<4>>],
+        bins: usize,
+    ) -> Tensor<4> {
+        let volumes = pairs.iter().map(|pair| correlation(pair, bins)).collect();
+        let volume = Tensor::cat(volumes, 1);
+        let [batch, channels, height, width, _] = volume.dims();
+        volume
+            .permute([0, 4, 1, 2, 3])
+            .reshape([batch, bins * channels, height, width])
     }
     fn conv3d(&mut self, _: &str, layer: &Conv3d, x: &Tensor<5>) -> Tensor<5> {
         layer.forward(x.clone())
@@ -169,6 +257,9 @@ impl Ops for Execute {
 
     fn relu(&mut self, x: &Tensor<4>) -> Tensor<4> {
         relu(x.clone())
+    }
+    fn sigmoid(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        sigmoid(x.clone())
     }
     fn relu_volume(&mut self, x: &Tensor<5>) -> Tensor<5> {
         relu(x.clone())
@@ -208,8 +299,11 @@ impl Ops for Execute {
     fn clamp(&mut self, low: f32, high: f32, x: &Tensor<4>) -> Tensor<4> {
         x.clone().clamp(low, high)
     }
-    fn softmax(&mut self, x: &Tensor<4>) -> Tensor<4> {
-        softmax(x.clone(), 1)
+    fn channel_max(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        x.clone().detach().max_dim(1)
+    }
+    fn channel_argmax(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        x.clone().detach().argmax(1).float()
     }
     fn channel_constant(&mut self, _: &str, values: &[f32]) -> Tensor<4> {
         Tensor::from_data(
@@ -221,6 +315,19 @@ impl Ops for Execute {
         a.clone() + b.clone()
     }
 
+    fn join(&mut self, first: &Tensor<4>, second: &Tensor<4>) -> Tensor<4> {
+        Tensor::cat(vec![first.clone(), second.clone()], 0)
+    }
+    fn halves(&mut self, x: &Tensor<4>) -> (Tensor<4>, Tensor<4>) {
+        let half = x.dims()[0] / 2;
+        (
+            x.clone().narrow(0, 0, half),
+            x.clone().narrow(0, half, half),
+        )
+    }
+    fn repeat_channels(&mut self, times: usize, x: &Tensor<4>) -> Tensor<4> {
+        x.clone().repeat_dim(1, times)
+    }
     fn concat(&mut self, maps: &[Tensor<4>]) -> Tensor<4> {
         Tensor::cat(maps.to_vec(), 1)
     }
@@ -229,6 +336,12 @@ impl Ops for Execute {
     }
     fn stack(&mut self, maps: &[Tensor<4>]) -> Tensor<5> {
         Tensor::stack(maps.to_vec(), 2)
+    }
+    fn as_volume(&mut self, bins: usize, x: &Tensor<4>) -> Tensor<5> {
+        let [batch, channels, height, width] = x.dims();
+        x.clone()
+            .reshape([batch, bins, channels / bins, height, width])
+            .swap_dims(1, 2)
     }
     fn disparities_as_channels(&mut self, x: &Tensor<5>) -> Tensor<4> {
         x.clone().squeeze_dim(1)
@@ -244,8 +357,8 @@ impl Ops for Execute {
                 .pad((by, 0, 0, 0), PadMode::Constant(0.0)),
         }
     }
-    fn pad_edge(&mut self, by: usize, x: &Tensor<4>) -> Tensor<4> {
-        x.clone().pad((by, by, by, by), PadMode::Edge)
+    fn pad_edge(&mut self, [left, right, top, bottom]: [usize; 4], x: &Tensor<4>) -> Tensor<4> {
+        x.clone().pad((left, right, top, bottom), PadMode::Edge)
     }
     fn pad_to_multiple(&mut self, multiple: usize, x: &Tensor<4>) -> Tensor<4> {
         let [_, _, height, width] = x.dims();
@@ -259,11 +372,48 @@ impl Ops for Execute {
         let [_, _, height, width] = like.dims();
         x.clone().narrow(2, 0, height).narrow(3, 0, width)
     }
-    fn depth_to_space(&mut self, r: usize, x: &Tensor<4>) -> Tensor<4> {
-        let [batch, _, height, width] = x.dims();
+    fn double(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        let [batch, channels, height, width] = x.dims();
         x.clone()
-            .reshape([batch, r, r, height, width])
-            .permute([0, 3, 1, 4, 2])
-            .reshape([batch, 1, height * r, width * r])
+            .reshape([batch, channels, height, 1, width, 1])
+            .expand([batch, channels, height, 2, width, 2])
+            .reshape([batch, channels, 2 * height, 2 * width])
     }
+    fn depth_to_space(&mut self, r: usize, x: &Tensor<4>) -> Tensor<4> {
+        let [batch, channels, height, width] = x.dims();
+        let channels = channels / (r * r);
+        x.clone()
+            .reshape([batch, channels, r, r, height, width])
+            .permute([0, 1, 4, 2, 5, 3])
+            .reshape([batch, channels, height * r, width * r])
+    }
+}
+
+/// One part of [`Ops::correlate`], `[batch, group, height, width, bin]`.
+///
+/// Rows are cut into blocks of `bins` columns. A block of the left row times the two blocks of the right row
+/// that its disparities reach into is a small matrix, whose diagonals are the disparities: written with one
+/// column more, row after row, they come to lie below one another.
+fn correlation(pair: &Correlated<'_, Tensor<4>>, bins: usize) -> Tensor<5> {
+    let [batch, channels, height, width] = pair.left.dims();
+    let blocks = width.div_ceil(bins);
+    let (whole, size) = (blocks * bins, channels / pair.groups);
+    // `[batch, group, height * block, channel, column]` of the map moved right by `by`.
+    let cut = |x: &Tensor<4>, by: usize| {
+        x.clone()
+            .pad((by, whole - width, 0, 0), PadMode::Constant(0.0))
+            .narrow(3, 0, whole)
+            .reshape([batch, pair.groups, size, height * blocks, bins])
+            .swap_dims(2, 3)
+    };
+    let left = cut(pair.left, 0).swap_dims(3, 4);
+    let right = Tensor::cat(vec![cut(pair.right, bins), cut(pair.right, 0)], 4);
+    let products = left.matmul(right);
+    products
+        .reshape([batch, pair.groups, height * blocks, 2 * bins * bins])
+        .pad((0, bins, 0, 0), PadMode::Constant(0.0))
+        .reshape([batch, pair.groups, height * blocks, bins, 2 * bins + 1])
+        .narrow(4, 1, bins)
+        .reshape([batch, pair.groups, height, whole, bins])
+        .narrow(3, 0, width)
 }

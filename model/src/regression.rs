@@ -1,11 +1,10 @@
-//! From probabilities to disparity: soft-argmin (Kendall 2017) and learned convex up-sampling
-//! (Teed 2020).
+//! From logits to disparity: soft-argmin (Kendall 2017) and learned convex up-sampling (Teed 2020).
 
 use burn::module::Module;
-use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::nn::conv::Conv2d;
 use burn::tensor::Device;
 
-use crate::features::conv3x3;
+use crate::features::{conv1x1, conv3x3};
 use crate::{Kernel, Ops, Prediction};
 
 /// The volume stands at this fraction of the resolution, so a bin is this many pixels.
@@ -13,6 +12,16 @@ pub const SCALE: usize = 4;
 
 const NEIGHBOURS: usize = 9;
 const SUBPIXELS: usize = SCALE * SCALE;
+
+/// Which bins the mean is taken over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Argmin {
+    /// All: every bin gets a gradient. For training.
+    Everywhere,
+    /// Two on either side of the most probable one: a second peak does not draw the mean into the empty
+    /// space between. For inference.
+    AroundPeak,
+}
 
 /// Up-samples by mixing the 3x3 coarse neighbours with weights learned from the image.
 #[derive(Module, Debug)]
@@ -26,30 +35,32 @@ impl Regression {
     pub fn init(context: usize, hidden: usize, device: &Device) -> Self {
         Self {
             look: conv3x3([context, hidden], 1, device),
-            mix: Conv2dConfig::new([hidden, NEIGHBOURS * SUBPIXELS], [1, 1]).init(device),
+            mix: conv1x1([hidden, NEIGHBOURS * SUBPIXELS], device),
         }
     }
 
     /// Disparity, standard deviation (pixels) and confidence at full resolution `[B, 1, 4h, 4w]`
-    /// from logits `[B, bins, h, w]`.
+    /// from logits `[B, bins, h, w]`, near to far, and the left image's features `[B, context, h, w]`.
     pub fn forward<O: Ops>(
         &self,
         ops: &mut O,
         bins: usize,
+        argmin: Argmin,
         logits: &O::Map,
         context: &O::Map,
     ) -> Prediction<O::Map> {
-        let probability = ops.softmax(logits);
-        let mean = self.expectation(ops, "mean", bins, &probability, |k| k);
-        let square = self.expectation(ops, "square", bins, &probability, |k| k * k);
-        let confidence = mass_around(ops, bins, &probability, &mean);
+        let Moments {
+            mean,
+            square,
+            confidence,
+        } = moments(ops, bins, argmin, logits);
 
         let hidden = ops.conv2d("regression.look", &self.look, context);
         let hidden = ops.relu(&hidden);
-        let logits = ops.conv2d("regression.mix", &self.mix, &hidden);
+        let mix = ops.conv2d("regression.mix", &self.mix, &hidden);
         // exp over its sum is a softmax without a reduction over a strided axis; the clamp keeps it finite.
-        let logits = ops.clamp(-12.0, 12.0, &logits);
-        let weights = ops.exp(&logits);
+        let mix = ops.clamp(-12.0, 12.0, &mix);
+        let weights = ops.exp(&mix);
         let sum = Kernel::from_fn([SUBPIXELS, NEIGHBOURS * SUBPIXELS, 1, 1], |s, c, _, _| {
             f32::from(c % SUBPIXELS == s)
         });
@@ -58,15 +69,11 @@ impl Regression {
             f32::from(c / SUBPIXELS == 3 * y + x)
         });
         let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
-            let padded = ops.pad_edge(1, x);
-            let around = ops.fixed_conv2d(
-                &format!("regression.{name}.around"),
-                &neighbours,
-                1,
-                &padded,
-            );
+            let padded = ops.pad_edge([1; 4], x);
+            let name = |what: &str| format!("regression.{name}.{what}");
+            let around = ops.fixed_conv2d(&name("around"), &neighbours, 1, &padded);
             let weighted = ops.mul(&weights, &around);
-            let mixed = ops.fixed_conv2d(&format!("regression.{name}.mix"), &sum, 1, &weighted);
+            let mixed = ops.fixed_conv2d(&name("mix"), &sum, 1, &weighted);
             let mixed = ops.div(&mixed, &total);
             ops.depth_to_space(SCALE, &mixed)
         };
@@ -93,30 +100,69 @@ impl Regression {
             confidence,
         }
     }
-
-    fn expectation<O: Ops>(
-        &self,
-        ops: &mut O,
-        name: &str,
-        bins: usize,
-        p: &O::Map,
-        value: impl Fn(f32) -> f32,
-    ) -> O::Map {
-        let kernel = Kernel::from_fn([1, bins, 1, 1], |_, k, _, _| value(k as f32));
-        ops.fixed_conv2d(&format!("regression.{name}"), &kernel, 1, p)
-    }
 }
 
-/// The probability within one bin of the mean, with a linear shoulder to two bins: 1 when the
-/// distribution has one narrow peak, small when it is flat or has two.
-fn mass_around<O: Ops>(ops: &mut O, bins: usize, probability: &O::Map, mean: &O::Map) -> O::Map {
+/// Of the distribution at every coarse pixel, in bins.
+struct Moments<M> {
+    mean: M,
+    /// Second moment about zero, of a distribution of that mean and of the whole distribution's spread about it.
+    square: M,
+    /// Probability near the peak, or near the mean.
+    confidence: M,
+}
+
+fn moments<O: Ops>(ops: &mut O, bins: usize, argmin: Argmin, logits: &O::Map) -> Moments<O::Map> {
+    // Not normalised: ratios of sums need no division of every bin.
+    let largest = ops.channel_max(logits);
+    let below = ops.sub(logits, &largest);
+    let likelihood = ops.exp(&below);
+    // Near to far: the first bin holds the largest disparity.
+    let moment = |ops: &mut O, name: &str, power: i32, x: &O::Map| {
+        let kernel = Kernel::from_fn([1, bins, 1, 1], |_, k, _, _| {
+            ((bins - 1 - k) as f32).powi(power)
+        });
+        ops.fixed_conv2d(&format!("regression.{name}"), &kernel, 1, x)
+    };
+    let total = moment(ops, "total", 0, &likelihood);
+    let first = moment(ops, "first", 1, &likelihood);
+    let first = ops.div(&first, &total);
+    let second = moment(ops, "second", 2, &likelihood);
+    let second = ops.div(&second, &total);
+
+    let centre = match argmin {
+        Argmin::Everywhere => ops.affine(-1.0, (bins - 1) as f32, &first),
+        Argmin::AroundPeak => ops.channel_argmax(logits),
+    };
+    // 1 within a bin and a half of the centre, 0 from two and a half on.
     let index: Vec<f32> = (0..bins).map(|k| k as f32).collect();
     let index = ops.channel_constant("regression.bins", &index);
-    let offset = ops.sub(&index, mean);
+    let offset = ops.sub(&index, &centre);
     let distance = ops.abs(&offset);
-    let window = ops.affine(-1.0, 2.0, &distance);
+    let window = ops.affine(-1.0, 2.5, &distance);
     let window = ops.clamp(0.0, 1.0, &window);
-    let inside = ops.mul(probability, &window);
-    let sum = Kernel::from_fn([1, bins, 1, 1], |_, _, _, _| 1.0);
-    ops.fixed_conv2d("regression.confidence", &sum, 1, &inside)
+    let inside = ops.mul(&likelihood, &window);
+    let near = moment(ops, "near", 0, &inside);
+    let confidence = ops.div(&near, &total);
+    let mean = match argmin {
+        Argmin::Everywhere => {
+            return Moments {
+                mean: first,
+                square: second,
+                confidence,
+            };
+        }
+        Argmin::AroundPeak => {
+            let near_first = moment(ops, "near_first", 1, &inside);
+            ops.div(&near_first, &near)
+        }
+    };
+    // E (k - mean)^2 + mean^2 = E k^2 + 2 mean (mean - E k).
+    let off = ops.sub(&mean, &first);
+    let off = ops.mul(&mean, &off);
+    let off = ops.affine(2.0, 0.0, &off);
+    Moments {
+        square: ops.add(&second, &off),
+        mean,
+        confidence,
+    }
 }

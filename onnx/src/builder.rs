@@ -47,6 +47,16 @@ impl GraphBuilder {
         name
     }
 
+    /// The two halves of `x` along an axis.
+    pub fn halves(&mut self, axis: i64, x: &str) -> (String, String) {
+        let first = self.node("halves", "Split", &[x], vec![Attribute::int("axis", axis)]);
+        let second = self.unique("halves.second");
+        if let Some(node) = self.nodes.last_mut() {
+            node.output.push(second.clone());
+        }
+        (first, second)
+    }
+
     /// A node named after its operator.
     pub fn plain(&mut self, op: &str, inputs: &[&str], attributes: Vec<Attribute>) -> String {
         self.node(&op.to_lowercase(), op, inputs, attributes)

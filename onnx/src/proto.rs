@@ -129,7 +129,7 @@ pub struct Tensor {
     pub raw_data: Vec<u8>,
 }
 
-const FLOAT: i32 = 1;
+pub const FLOAT: i32 = 1;
 const INT64: i32 = 7;
 
 impl Tensor {

@@ -102,8 +102,22 @@ pub struct Args {
 
 #[derive(Clone, Copy, ValueEnum)]
 enum PresetArg {
-    /// 0.2 M parameters, trains on a laptop in minutes
+    /// Trains on a laptop in minutes
     Tiny,
+    /// Real time on two CPU cores
+    Rover,
+    /// The network of Hong 2021, with 3-D convolutions: accuracy first
+    Paper,
+}
+
+impl From<PresetArg> for Preset {
+    fn from(preset: PresetArg) -> Self {
+        match preset {
+            PresetArg::Tiny => Self::Tiny,
+            PresetArg::Rover => Self::Rover,
+            PresetArg::Paper => Self::Paper,
+        }
+    }
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -195,15 +209,11 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
         args.data.clone()
     };
     let sources = open_all(&data, &args.unchecked, output)?;
+    let preset = Preset::from(args.preset);
     let init = match (&args.init, args.finetune) {
         (Some(init), _) => Some(init.clone()),
-        (None, true) => Some(match args.preset {
-            PresetArg::Tiny => "tiny".to_owned(),
-        }),
+        (None, true) => Some(preset.name().to_owned()),
         (None, false) => None,
-    };
-    let preset = match args.preset {
-        PresetArg::Tiny => Preset::Tiny,
     };
     let schedule = if args.finetune {
         Schedule::FINETUNE

@@ -301,7 +301,7 @@ impl Trainer {
             &self.device,
         );
 
-        let prediction = self.net.forward(batch.seen_left, batch.seen_right);
+        let prediction = self.net.forward_training(batch.seen_left, batch.seen_right);
         let terms =
             self.config
                 .loss

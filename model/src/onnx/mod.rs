@@ -10,13 +10,13 @@ use std::path::Path;
 use barchan_onnx::{Message, proto};
 
 use crate::weights::write_atomically;
-use crate::{ModelError, StereoNet};
+use crate::{Argmin, ModelError, StereoNet};
 
 /// The network as the bytes of an ONNX file.
 pub fn to_bytes(net: &StereoNet) -> Vec<u8> {
     let mut writer = writer::GraphWriter::default();
     let (left, right) = ("left".to_owned(), "right".to_owned());
-    let prediction = net.run(&mut writer, &left, &right);
+    let prediction = net.run(&mut writer, Argmin::AroundPeak, &left, &right);
     let outputs = [
         ("disparity", prediction.disparity),
         ("confidence", prediction.confidence),

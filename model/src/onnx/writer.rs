@@ -1,13 +1,14 @@
 //! The vocabulary of blocks, written down as ONNX nodes.
 
 use barchan_onnx::GraphBuilder;
-use barchan_onnx::proto::Attribute;
+use barchan_onnx::proto::{Attribute, FLOAT};
 use burn::module::Param;
-use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose2d, ConvTranspose3d};
+use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
 use burn::nn::{PaddingConfig2d, PaddingConfig3d};
 use burn::tensor::Tensor;
 
-use crate::{Kernel, Ops};
+use crate::planar::DisparityMix;
+use crate::{Correlated, Kernel, Ops};
 
 /// Writes what blocks ask for into a graph; a value is the name of the node's output.
 #[derive(Default)]
@@ -18,9 +19,7 @@ pub struct GraphWriter {
 impl GraphWriter {
     /// A learned tensor. Both images pass the same layer, so it may be there already.
     fn parameter<const D: usize>(&mut self, name: &str, value: &Tensor<D>) -> String {
-        self.graph.shared(name, &value.dims(), || {
-            value.to_data().iter::<f32>().collect::<Vec<_>>()
-        })
+        self.graph.shared(name, &value.dims(), || values(value))
     }
 
     /// A learned convolution; `pads` are those before every axis, then those after.
@@ -54,6 +53,41 @@ impl GraphWriter {
         let (from, to) = (self.graph.ints(&[2]), self.graph.ints(&[4]));
         self.graph.plain("Slice", &[&shape, &from, &to], vec![])
     }
+
+    /// Height and width, each a list of one.
+    fn sides(&mut self, x: &str) -> [String; 2] {
+        let shape = self.graph.plain("Shape", &[x], vec![]);
+        [2, 3].map(|axis| {
+            let (from, to) = (self.graph.ints(&[axis]), self.graph.ints(&[axis + 1]));
+            self.graph.plain("Slice", &[&shape, &from, &to], vec![])
+        })
+    }
+
+    /// What `sizes` lack to the next multiple.
+    fn missing(&mut self, sizes: &str, multiple: i64) -> String {
+        let multiple = self.graph.ints(&[multiple]);
+        let over = self.graph.plain("Mod", &[sizes, &multiple], vec![]);
+        let missing = self.graph.plain("Sub", &[&multiple, &over], vec![]);
+        self.graph.plain("Mod", &[&missing, &multiple], vec![])
+    }
+
+    /// Lists of whole numbers after one another.
+    fn concat_shape(&mut self, parts: &[&str]) -> String {
+        self.graph
+            .plain("Concat", parts, vec![Attribute::int("axis", 0)])
+    }
+
+    /// The channels of `x` counted anew, the batch following.
+    fn channels_reshaped(&mut self, name: &str, channels: usize, x: &str) -> String {
+        let size = self.height_and_width(x);
+        let start = self.graph.ints(&[-1, channels as i64]);
+        let shape = self.concat_shape(&[&start, &size]);
+        self.graph.node(name, "Reshape", &[x, &shape], vec![])
+    }
+}
+
+fn values<const D: usize>(tensor: &Tensor<D>) -> Vec<f32> {
+    tensor.to_data().iter::<f32>().collect()
 }
 
 fn padding_2d(padding: &PaddingConfig2d) -> [usize; 4] {
@@ -87,13 +121,126 @@ impl Ops for GraphWriter {
         ];
         self.convolution("Conv", name, &layer.weight, &layer.bias, shape, x)
     }
-    fn conv_transpose2d(&mut self, name: &str, layer: &ConvTranspose2d, x: &String) -> String {
-        let shape = [
-            &layer.kernel_size[..],
-            &layer.stride,
-            &both_ends(&layer.padding),
+    fn conv2d_per_bin(&mut self, name: &str, layer: &Conv2d, bins: usize, x: &String) -> String {
+        /// Channels in which ONNX Runtime's fast convolutions on AVX-512 count.
+        const LANES: usize = 16;
+        let [output, input, ..] = layer.weight.dims();
+        if !input.is_multiple_of(LANES) {
+            let apart = self.channels_reshaped(&format!("{name}.apart"), input, x);
+            let y = self.conv2d(name, layer, &apart);
+            return self.channels_reshaped(&format!("{name}.together"), bins * output, &y);
+        }
+        // A grouped convolution moves no number; its groups are copies of one kernel.
+        let copies = |values: Vec<f32>| values.repeat(bins);
+        let mut shape = layer.weight.dims();
+        shape[0] *= bins;
+        let weight = self.graph.shared(&format!("{name}.weight"), &shape, || {
+            copies(values(&layer.weight.val()))
+        });
+        let mut inputs = vec![x.clone(), weight];
+        if let Some(bias) = &layer.bias {
+            inputs.push(
+                self.graph
+                    .shared(&format!("{name}.bias"), &[bins * output], || {
+                        copies(values(&bias.val()))
+                    }),
+            );
+        }
+        let inputs: Vec<&str> = inputs.iter().map(String::as_str).collect();
+        let attributes = vec![
+            Attribute::ints("kernel_shape", &layer.kernel_size),
+            Attribute::ints("strides", &layer.stride),
+            Attribute::ints("pads", &padding_2d(&layer.padding)),
+            Attribute::int("group", bins as i64),
         ];
-        self.convolution("ConvTranspose", name, &layer.weight, &layer.bias, shape, x)
+        self.graph.node(name, "Conv", &inputs, attributes)
+    }
+    fn disparity_mix(
+        &mut self,
+        name: &str,
+        layer: &DisparityMix,
+        bins: usize,
+        x: &String,
+    ) -> String {
+        let (weight, bias) = layer.banded(bins);
+        let inputs = [
+            x.clone(),
+            self.parameter(&format!("{name}.weight"), &weight),
+            self.parameter(&format!("{name}.bias"), &bias),
+        ];
+        let inputs: Vec<&str> = inputs.iter().map(String::as_str).collect();
+        let attributes = vec![Attribute::ints("kernel_shape", &[1, 1])];
+        self.graph.node(name, "Conv", &inputs, attributes)
+    }
+    /// As [`crate::Execute`] does it; see there for how the diagonals are read off.
+    fn correlate(&mut self, name: &str, pairs: &[Correlated<'_, String>], bins: usize) -> String {
+        let d = bins as i64;
+        let volumes: Vec<String> = pairs
+            .iter()
+            .map(|pair| {
+                let (groups, size) = (pair.groups as i64, (pair.channels / pair.groups) as i64);
+                let [height, width] = self.sides(pair.left);
+                let blocks = self.graph.ints(&[0, groups, size, -1, d]);
+                let cut = |this: &mut Self, x: &String, by: i64| {
+                    let missing = this.missing(&width, d);
+                    let by_end = this.graph.ints(&[by]);
+                    let after = this.graph.plain("Sub", &[&missing, &by_end], vec![]);
+                    let before = this.graph.ints(&[0, 0, 0, by, 0, 0, 0]);
+                    let pads = this.concat_shape(&[&before, &after]);
+                    let x = this.graph.plain("Pad", &[x, &pads], vec![]);
+                    this.graph.plain("Reshape", &[&x, &blocks], vec![])
+                };
+                let transpose = |this: &mut Self, perm: [usize; 5], x: &String| {
+                    let perm = vec![Attribute::ints("perm", &perm)];
+                    this.graph.plain("Transpose", &[x], perm)
+                };
+                // `[batch, group, height * block, ...]`: left by column and channel, right by channel and column.
+                let left = cut(self, pair.left, 0);
+                let left = transpose(self, [0, 1, 3, 4, 2], &left);
+                let [near, far] = [d, 0].map(|by| {
+                    let right = cut(self, pair.right, by);
+                    transpose(self, [0, 1, 3, 2, 4], &right)
+                });
+                let side_by_side = vec![Attribute::int("axis", 4)];
+                // Whichever is the smaller is put together: what is multiplied, or the products.
+                let products = if size <= d {
+                    let right = self.graph.plain("Concat", &[&near, &far], side_by_side);
+                    self.graph.node(name, "MatMul", &[&left, &right], vec![])
+                } else {
+                    let [near, far] = [near, far]
+                        .map(|right| self.graph.node(name, "MatMul", &[&left, &right], vec![]));
+                    self.graph.plain("Concat", &[&near, &far], side_by_side)
+                };
+                let flat = self.graph.ints(&[0, 0, 0, 2 * d * d]);
+                let flat = self.graph.plain("Reshape", &[&products, &flat], vec![]);
+                let pads = self.graph.ints(&[0, 0, 0, 0, 0, 0, 0, d]);
+                let flat = self.graph.plain("Pad", &[&flat, &pads], vec![]);
+                let skewed = self.graph.ints(&[0, 0, 0, d, 2 * d + 1]);
+                let skewed = self.graph.plain("Reshape", &[&flat, &skewed], vec![]);
+                let (from, to, axis) = (
+                    self.graph.ints(&[1]),
+                    self.graph.ints(&[d + 1]),
+                    self.graph.ints(&[4]),
+                );
+                let diagonals = self
+                    .graph
+                    .plain("Slice", &[&skewed, &from, &to, &axis], vec![]);
+                let (start, end) = (self.graph.ints(&[0, groups]), self.graph.ints(&[-1, d]));
+                let rows = self.concat_shape(&[&start, &height, &end]);
+                let rows = self.graph.plain("Reshape", &[&diagonals, &rows], vec![]);
+                let (from, axis) = (self.graph.ints(&[0]), self.graph.ints(&[3]));
+                self.graph
+                    .plain("Slice", &[&rows, &from, &width, &axis], vec![])
+            })
+            .collect();
+        let volume = self.concat(&volumes);
+        let perm = vec![Attribute::ints("perm", &[0, 4, 1, 2, 3])];
+        let volume = self.graph.plain("Transpose", &[&volume], perm);
+        let groups: usize = pairs.iter().map(|p| p.groups).sum();
+        let size = self.height_and_width(pairs[0].left);
+        let start = self.graph.ints(&[0, (bins * groups) as i64]);
+        let shape = self.concat_shape(&[&start, &size]);
+        self.graph.plain("Reshape", &[&volume, &shape], vec![])
     }
     fn conv3d(&mut self, name: &str, layer: &Conv3d, x: &String) -> String {
         let shape = [
@@ -126,6 +273,9 @@ impl Ops for GraphWriter {
 
     fn relu(&mut self, x: &String) -> String {
         self.graph.plain("Relu", &[x], vec![])
+    }
+    fn sigmoid(&mut self, x: &String) -> String {
+        self.graph.plain("Sigmoid", &[x], vec![])
     }
     fn relu_volume(&mut self, x: &String) -> String {
         self.graph.plain("Relu", &[x], vec![])
@@ -184,9 +334,16 @@ impl Ops for GraphWriter {
         let (low, high) = (self.graph.scalar(low), self.graph.scalar(high));
         self.graph.plain("Clip", &[x, &low, &high], vec![])
     }
-    fn softmax(&mut self, x: &String) -> String {
-        self.graph
-            .plain("Softmax", &[x], vec![Attribute::int("axis", 1)])
+    fn channel_max(&mut self, x: &String) -> String {
+        let axis = vec![Attribute::ints("axes", &[1])];
+        self.graph.plain("ReduceMax", &[x], axis)
+    }
+    fn channel_argmax(&mut self, x: &String) -> String {
+        let largest = self
+            .graph
+            .plain("ArgMax", &[x], vec![Attribute::int("axis", 1)]);
+        let to = vec![Attribute::int("to", FLOAT.into())];
+        self.graph.plain("Cast", &[&largest], to)
     }
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> String {
         self.graph
@@ -196,6 +353,16 @@ impl Ops for GraphWriter {
         self.graph.plain("Add", &[a, b], vec![])
     }
 
+    fn join(&mut self, first: &String, second: &String) -> String {
+        let axis = vec![Attribute::int("axis", 0)];
+        self.graph.plain("Concat", &[first, second], axis)
+    }
+    fn halves(&mut self, x: &String) -> (String, String) {
+        self.graph.halves(0, x)
+    }
+    fn repeat_channels(&mut self, times: usize, x: &String) -> String {
+        self.concat(&vec![x.clone(); times])
+    }
     fn concat(&mut self, maps: &[String]) -> String {
         let inputs: Vec<&str> = maps.iter().map(String::as_str).collect();
         self.graph
@@ -213,6 +380,14 @@ impl Ops for GraphWriter {
         let inputs: Vec<&str> = planes.iter().map(String::as_str).collect();
         self.graph
             .plain("Concat", &inputs, vec![Attribute::int("axis", 2)])
+    }
+    fn as_volume(&mut self, bins: usize, x: &String) -> String {
+        let size = self.height_and_width(x);
+        let start = self.graph.ints(&[0, bins as i64, -1]);
+        let shape = self.concat_shape(&[&start, &size]);
+        let y = self.graph.plain("Reshape", &[x, &shape], vec![]);
+        let perm = vec![Attribute::ints("perm", &[0, 2, 1, 3, 4])];
+        self.graph.plain("Transpose", &[&y], perm)
     }
     fn disparities_as_channels(&mut self, x: &String) -> String {
         let axis = self.graph.ints(&[1]);
@@ -234,31 +409,33 @@ impl Ops for GraphWriter {
         self.graph
             .plain("Slice", &[&padded, &from, &to, &axis], vec![])
     }
-    fn pad_edge(&mut self, by: usize, x: &String) -> String {
-        let by = by as i64;
-        let pads = self.graph.ints(&[0, 0, by, by, 0, 0, by, by]);
-        self.graph
-            .plain("Pad", &[x, &pads], vec![Attribute::string("mode", "edge")])
+    fn pad_edge(&mut self, by: [usize; 4], x: &String) -> String {
+        let [left, right, top, bottom] = by.map(|n| n as i64);
+        let pads = self.graph.ints(&[0, 0, top, left, 0, 0, bottom, right]);
+        let edge = vec![Attribute::string("mode", "edge")];
+        self.graph.plain("Pad", &[x, &pads], edge)
     }
     fn pad_to_multiple(&mut self, multiple: usize, x: &String) -> String {
         let size = self.height_and_width(x);
-        let multiple = self.graph.ints(&[multiple as i64; 2]);
-        let over = self.graph.plain("Mod", &[&size, &multiple], vec![]);
-        let missing = self.graph.plain("Sub", &[&multiple, &over], vec![]);
-        let missing = self.graph.plain("Mod", &[&missing, &multiple], vec![]);
+        let missing = self.missing(&size, multiple as i64);
         let before = self.graph.ints(&[0; 6]);
-        let pads = self.graph.plain(
-            "Concat",
-            &[&before, &missing],
-            vec![Attribute::int("axis", 0)],
-        );
-        self.graph
-            .plain("Pad", &[x, &pads], vec![Attribute::string("mode", "edge")])
+        let pads = self.concat_shape(&[&before, &missing]);
+        let edge = vec![Attribute::string("mode", "edge")];
+        self.graph.plain("Pad", &[x, &pads], edge)
     }
     fn crop_to(&mut self, like: &String, x: &String) -> String {
         let size = self.height_and_width(like);
         let (from, axes) = (self.graph.ints(&[0, 0]), self.graph.ints(&[2, 3]));
         self.graph.plain("Slice", &[x, &from, &size, &axes], vec![])
+    }
+    fn double(&mut self, x: &String) -> String {
+        let scales = self.graph.floats("scales", &[4], [1.0, 1.0, 2.0, 2.0]);
+        let attributes = vec![
+            Attribute::string("mode", "nearest"),
+            Attribute::string("nearest_mode", "floor"),
+            Attribute::string("coordinate_transformation_mode", "asymmetric"),
+        ];
+        self.graph.plain("Resize", &[x, "", &scales], attributes)
     }
     fn depth_to_space(&mut self, r: usize, x: &String) -> String {
         let attributes = vec![
