@@ -2,8 +2,8 @@
 
 use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
 use burn::tensor::activation::{relu, sigmoid};
-use burn::tensor::module::conv2d;
-use burn::tensor::ops::{ConvOptions, PadMode};
+use burn::tensor::module::{avg_pool2d, conv2d};
+use burn::tensor::ops::{AvgPoolOptions, ConvOptions, PadMode};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::planar::DisparityMix;
@@ -135,6 +135,10 @@ pub trait Ops {
     fn abs(&mut self, x: &Self::Map) -> Self::Map;
     /// `x` limited to `low..=high`.
     fn clamp(&mut self, low: f32, high: f32, x: &Self::Map) -> Self::Map;
+    /// The mean of the channels at every pixel.
+    fn channel_mean(&mut self, x: &Self::Map) -> Self::Map;
+    /// The mean over windows of `size` x `size`, every `stride` pixels, without padding.
+    fn average_pool(&mut self, size: usize, stride: usize, x: &Self::Map) -> Self::Map;
     /// The largest channel at every pixel; a constant to the gradient.
     fn channel_max(&mut self, x: &Self::Map) -> Self::Map;
     /// The number of the largest channel at every pixel.
@@ -298,6 +302,15 @@ impl Ops for Execute {
     }
     fn clamp(&mut self, low: f32, high: f32, x: &Tensor<4>) -> Tensor<4> {
         x.clone().clamp(low, high)
+    }
+    fn channel_mean(&mut self, x: &Tensor<4>) -> Tensor<4> {
+        x.clone().mean_dim(1)
+    }
+    fn average_pool(&mut self, size: usize, stride: usize, x: &Tensor<4>) -> Tensor<4> {
+        avg_pool2d(
+            x.clone(),
+            AvgPoolOptions::new([size; 2]).with_stride([stride; 2]),
+        )
     }
     fn channel_max(&mut self, x: &Tensor<4>) -> Tensor<4> {
         x.clone().detach().max_dim(1)

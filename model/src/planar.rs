@@ -141,7 +141,8 @@ impl Planar {
         matching.weight =
             Param::from_data(TensorData::new(census_matching(raw), [1, raw, 3]), device);
         Self {
-            match_quarter: conv3x3([features[0], config.matching[0]], 1, device),
+            // A 3x3 one costs as much as a block of the aggregation.
+            match_quarter: conv1x1([features[0], config.matching[0]], device),
             match_eighth: conv3x3([features[1], config.matching[1]], 1, device),
             down_eighth: conv3x3([2 * raw, eighth], 2, device),
             join_eighth: conv1x1([config.groups[1], eighth], device),

@@ -58,13 +58,14 @@ impl Regression {
         let hidden = ops.conv2d("regression.look", &self.look, context);
         let hidden = ops.relu(&hidden);
         let mix = ops.conv2d("regression.mix", &self.mix, &hidden);
-        // exp over its sum is a softmax without a reduction over a strided axis; the clamp keeps it finite.
-        let mix = ops.clamp(-12.0, 12.0, &mix);
-        let weights = ops.exp(&mix);
+        // Positive weights over their sum. Far below zero a sigmoid is an exponential, so this chooses as a
+        // softmax does; it joins the convolution before it, and its sum is a convolution too.
+        let weights = ops.sigmoid(&mix);
         let sum = Kernel::from_fn([SUBPIXELS, NEIGHBOURS * SUBPIXELS, 1, 1], |s, c, _, _| {
             f32::from(c % SUBPIXELS == s)
         });
-        let total = ops.fixed_conv2d("regression.total", &sum, 1, &weights);
+        let total = ops.fixed_conv2d("regression.weights", &sum, 1, &weights);
+        let total = ops.affine(1.0, 1e-12, &total);
         let neighbours = Kernel::from_fn([NEIGHBOURS * SUBPIXELS, 1, 3, 3], |c, _, y, x| {
             f32::from(c / SUBPIXELS == 3 * y + x)
         });

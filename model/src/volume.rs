@@ -47,19 +47,16 @@ impl<M> Census<M> {
 /// -1..1, so that faint sand and bright rock speak equally loud. The product of two descriptors is the
 /// agreement over 24 x 24 pixels of the image, at most 1.
 pub fn census_descriptors<O: Ops>(ops: &mut O, images: &O::Map) -> Census<O::Map> {
-    let grey_half = Kernel::from_fn([1, 3, 2, 2], |_, _, _, _| 1.0 / 12.0);
-    let grey = ops.fixed_conv2d("census.grey", &grey_half, 2, images);
-    let window = Kernel::from_fn([1, 1, WINDOW, WINDOW], |_, _, _, _| {
-        1.0 / (WINDOW * WINDOW) as f32
-    });
-    let mean = |ops: &mut O, name: &str, x: &O::Map| {
+    let half = ops.average_pool(2, 2, images);
+    let grey = ops.channel_mean(&half);
+    let mean = |ops: &mut O, x: &O::Map| {
         let padded = ops.pad_edge([WINDOW / 2; 4], x);
-        ops.fixed_conv2d(name, &window, 1, &padded)
+        ops.average_pool(WINDOW, 1, &padded)
     };
-    let local = mean(ops, "census.mean", &grey);
+    let local = mean(ops, &grey);
     let centred = ops.sub(&grey, &local);
     let square = ops.mul(&centred, &centred);
-    let variance = mean(ops, "census.variance", &square);
+    let variance = mean(ops, &square);
     // The floor is noise of 1.4 % of the image's own contrast.
     let variance = ops.affine(1.0, 2e-4, &variance);
     let contrast = ops.sqrt(&variance);

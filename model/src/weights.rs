@@ -128,6 +128,11 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
     std::fs::rename(&part, path).map_err(failed)
 }
 
+/// Burn names the variant of an enum too, as Rust does, in capitals; a file's names should not change with it.
+fn is_layer(name: &str) -> bool {
+    !name.starts_with(char::is_uppercase)
+}
+
 /// Every parameter by name: shape and little-endian bytes.
 #[derive(Default)]
 struct Collect {
@@ -137,10 +142,14 @@ struct Collect {
 
 impl ModuleVisitor for Collect {
     fn enter_module(&mut self, name: &str, _: &str) {
-        self.path.push(name.to_owned());
+        if is_layer(name) {
+            self.path.push(name.to_owned());
+        }
     }
-    fn exit_module(&mut self, _: &str, _: &str) {
-        self.path.pop();
+    fn exit_module(&mut self, name: &str, _: &str) {
+        if is_layer(name) {
+            self.path.pop();
+        }
     }
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         let data = param.val().into_data();
@@ -158,10 +167,14 @@ struct Apply {
 
 impl ModuleMapper for Apply {
     fn enter_module(&mut self, name: &str, _: &str) {
-        self.path.push(name.to_owned());
+        if is_layer(name) {
+            self.path.push(name.to_owned());
+        }
     }
-    fn exit_module(&mut self, _: &str, _: &str) {
-        self.path.pop();
+    fn exit_module(&mut self, name: &str, _: &str) {
+        if is_layer(name) {
+            self.path.pop();
+        }
     }
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
         let name = self.path.join(".");

@@ -334,6 +334,17 @@ impl Ops for GraphWriter {
         let (low, high) = (self.graph.scalar(low), self.graph.scalar(high));
         self.graph.plain("Clip", &[x, &low, &high], vec![])
     }
+    fn channel_mean(&mut self, x: &String) -> String {
+        let axis = vec![Attribute::ints("axes", &[1])];
+        self.graph.plain("ReduceMean", &[x], axis)
+    }
+    fn average_pool(&mut self, size: usize, stride: usize, x: &String) -> String {
+        let attributes = vec![
+            Attribute::ints("kernel_shape", &[size; 2]),
+            Attribute::ints("strides", &[stride; 2]),
+        ];
+        self.graph.plain("AveragePool", &[x], attributes)
+    }
     fn channel_max(&mut self, x: &String) -> String {
         let axis = vec![Attribute::ints("axes", &[1])];
         self.graph.plain("ReduceMax", &[x], axis)
