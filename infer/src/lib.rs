@@ -15,6 +15,8 @@ mod classical;
 mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
+#[cfg(feature = "onnxruntime")]
+mod quantize;
 mod rejection;
 
 #[cfg(feature = "burn")]
@@ -23,4 +25,6 @@ pub use classical::{BlockMatching, SemiGlobal};
 pub use engine::{DisparityEngine, DisparityMap, InferError};
 #[cfg(feature = "onnxruntime")]
 pub use onnxruntime::{OnnxEngine, Runtime};
+#[cfg(feature = "onnxruntime")]
+pub use quantize::{QuantizeError, QuantizeOptions, Quantized, RangeRule, quantize};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};
