@@ -8,7 +8,7 @@ use ort::value::TensorRef;
 
 use super::QuantizeError;
 use super::plan::Plan;
-use super::range::{Affine, Histogram, RangeRule};
+use super::range::{Affine, Histogram};
 use crate::engine::check_sizes;
 use crate::{InferError, Runtime};
 
@@ -22,7 +22,7 @@ pub(super) fn calibrate(
     plan: &Plan,
     runtime: &Runtime,
     pairs: impl IntoIterator<Item = Result<StereoFrame, DataError>>,
-    rule: RangeRule,
+    percentile: f64,
 ) -> Result<(Vec<Affine>, usize), QuantizeError> {
     // Inputs are at hand; of the rest every one becomes an output.
     let (inputs, inner): (Vec<_>, Vec<_>) =
@@ -89,7 +89,10 @@ pub(super) fn calibrate(
     if count == 0 {
         return Err(QuantizeError::NoPairs);
     }
-    Ok((histograms.iter().map(|h| h.affine(rule)).collect(), count))
+    Ok((
+        histograms.iter().map(|h| h.affine(percentile)).collect(),
+        count,
+    ))
 }
 
 fn failed<T>(error: ort::Error<T>) -> QuantizeError {

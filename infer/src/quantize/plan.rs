@@ -72,11 +72,12 @@ pub(super) fn plan(graph: &Graph, options: &QuantizeOptions) -> Result<Plan, Qua
             Some(reason) => float.push((node.name.clone(), reason)),
             None => {
                 // A Relu that alone reads the convolution becomes part of it.
-                let output = match readers.get(node.output[0].as_str()).map(Vec::as_slice) {
-                    Some([relu]) if relu.op_type == "Relu" && !is_output(&node.output[0]) => {
-                        &relu.output[0]
+                let own = &node.output[0];
+                let output = match readers.get(own.as_str()).map(Vec::as_slice) {
+                    Some([relu]) if relu.op_type == "Relu" && !is_output(own) => {
+                        relu.output.first().unwrap_or(own)
                     }
-                    _ => &node.output[0],
+                    _ => own,
                 };
                 if is_output(output) {
                     float.push((node.name.clone(), "is an output of the network".into()));
@@ -150,9 +151,13 @@ fn worth(
         ));
     };
     if let Some(bias) = bias {
-        let found = constants[bias.as_str()].to_floats().map(|b| b.len() as i64);
-        if found != Some(weights.dims[0]) {
-            return Err(wrong("its bias is no float tensor of one value per output"));
+        let offsets = constants[bias.as_str()].to_floats();
+        let fits =
+            |b: &Vec<f32>| b.len() as i64 == weights.dims[0] && b.iter().all(|v| v.is_finite());
+        if !offsets.as_ref().is_some_and(fits) {
+            return Err(wrong(
+                "its bias is no float tensor of one finite value per output",
+            ));
         }
     }
     if values.iter().any(|v| !v.is_finite()) {
@@ -167,7 +172,7 @@ fn worth(
     let (outputs, inputs) = (weights.dims[0] as usize, weights.dims[1] as usize);
     let group = node.attribute.iter().find(|a| a.name == "group");
     let group = group.and_then(|a| a.i).unwrap_or(1).max(1) as usize;
-    let intensity = values.len() / (inputs * group + outputs);
+    let intensity = values.len() / (inputs.saturating_mul(group).saturating_add(outputs));
     let volumetric = usize::from(weights.dims.len() > 4);
     Ok(
         (inputs * outputs < MIN_CHANNELS || intensity < MIN_INTENSITY[volumetric])

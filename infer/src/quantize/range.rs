@@ -1,17 +1,5 @@
 //! What is known of an activation, and the 8 bits that follow from it.
 
-/// How the range that 256 levels cover follows from what calibration saw.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum RangeRule {
-    /// From the smallest to the largest value: nothing is clipped.
-    MinMax,
-    /// The values between this percentile from either end; 99.99 clips one value in ten thousand
-    /// above and below.
-    Percentile(f64),
-    /// The range of least squared error: what clipping loses against what finer steps win.
-    LeastSquares,
-}
-
 /// `real = scale * (level - zero)`, level in 0..=255; zero itself is exact.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Affine {
@@ -87,50 +75,22 @@ impl Histogram {
         true
     }
 
-    /// The 256 levels by `rule`.
-    pub fn affine(&self, rule: RangeRule) -> Affine {
-        let (low, high) = (f64::from(self.low), f64::from(self.high));
-        match rule {
-            RangeRule::MinMax => Affine::covering(low, high),
-            RangeRule::Percentile(percent) => {
-                let total: u64 = self.counts.iter().sum();
-                let clipped = (total as f64 * (1.0 - percent.clamp(50.0, 100.0) / 100.0)) as u64;
-                let edge = |bin: &dyn Fn(usize) -> usize| {
-                    let mut seen = 0;
-                    (0..2 * HALF).map(bin).find(|bin| {
-                        seen += self.counts[*bin];
-                        seen > clipped
-                    })
-                };
-                let bottom = edge(&|i| i).map_or(low, |bin| self.bound(bin));
-                let top = edge(&|i| 2 * HALF - 1 - i).map_or(high, |bin| self.bound(bin + 1));
-                Affine::covering(bottom.max(low), top.min(high))
-            }
-            RangeRule::LeastSquares => (0..=140)
-                .map(|step| 1.0 - f64::from(step) * 0.005)
-                .map(|share| (self.squared_error(share * low, share * high), share))
-                .min_by(|a, b| a.0.total_cmp(&b.0))
-                .map_or(Affine::covering(low, high), |(_, share)| {
-                    Affine::covering(share * low, share * high)
-                }),
-        }
-    }
-
-    /// Sum of squared errors of levels over `low..=high`: a twelfth of the squared step inside,
-    /// the squared distance to the range outside.
-    fn squared_error(&self, low: f64, high: f64) -> f64 {
-        let inside = ((high - low) / 255.0).powi(2) / 12.0;
-        let error = |(bin, count): (usize, &u64)| {
-            let middle = 0.5 * (self.bound(bin) + self.bound(bin + 1));
-            let beyond = (low - middle).max(middle - high).max(0.0);
-            *count as f64 * (inside + beyond * beyond)
+    /// 256 levels over the values between this percentile from either end; 100 clips none.
+    pub fn affine(&self, percentile: f64) -> Affine {
+        let total: u64 = self.counts.iter().sum();
+        let share = 1.0 - percentile.clamp(50.0, 100.0) / 100.0;
+        let clipped = (total as f64 * share) as u64;
+        let edge = |bin: &dyn Fn(usize) -> usize| {
+            let mut seen = 0;
+            (0..2 * HALF).map(bin).find(|bin| {
+                seen += self.counts[*bin];
+                seen > clipped
+            })
         };
-        self.counts
-            .iter()
-            .enumerate()
-            .filter(|(_, count)| **count > 0)
-            .map(error)
-            .sum()
+        let (low, high) = (f64::from(self.low), f64::from(self.high));
+        let bottom = edge(&|i| i).map_or(low, |bin| self.bound(bin));
+        let top = edge(&|i| 2 * HALF - 1 - i).map_or(high, |bin| self.bound(bin + 1));
+        Affine::covering(bottom.max(low), top.min(high))
     }
 
     /// Lower bound of a bin.
@@ -227,19 +187,33 @@ mod tests {
     }
 
     #[test]
-    fn rules_clip_what_they_promise() {
+    fn a_percentile_clips_what_it_promises() {
         let mut histogram = Histogram::default();
-        let mut values: Vec<f32> = (0..100_000).map(|i| i as f32 / 100_000.0).collect();
+        let values: Vec<f32> = (0..100_000).map(|i| i as f32 / 100_000.0).collect();
         assert!(histogram.add(&values));
-        values.clear();
-        values.resize(5, 100.0);
-        assert!(histogram.add(&values));
-        let top = |rule| 255.0 * histogram.affine(rule).scale;
-        assert!((top(RangeRule::MinMax) - 100.0).abs() < 1e-3);
-        assert!((top(RangeRule::Percentile(99.9)) - 1.0).abs() < 0.05);
-        // Five values of 100 outweigh the finer steps of the rest.
-        assert!(top(RangeRule::LeastSquares) > 50.0);
-        assert_eq!(histogram.affine(RangeRule::MinMax).zero, 0);
+        assert!(histogram.add(&[100.0; 5]));
+        let top = |percentile| 255.0 * histogram.affine(percentile).scale;
+        assert!((top(100.0) - 100.0).abs() < 1e-3);
+        assert!((top(99.9) - 1.0).abs() < 0.05);
+        assert_eq!(histogram.affine(99.9).zero, 0);
+        assert_eq!(histogram.counts.iter().sum::<u64>(), 99_999 + 5);
         assert!(!histogram.add(&[1.0, f32::NAN]) && !histogram.add(&[f32::INFINITY]));
+        assert_eq!(
+            Histogram::default().affine(99.9),
+            Affine::covering(0.0, 0.0)
+        );
+    }
+
+    #[test]
+    fn both_signs_and_growing_values_keep_their_places() {
+        let mut histogram = Histogram::default();
+        for power in -30..10 {
+            assert!(histogram.add(&[-(2f32.powi(power)), 3.0 * 2f32.powi(power)]));
+        }
+        let Affine { scale, zero } = histogram.affine(100.0);
+        assert!((255.0 * scale - 2048.0).abs() < 0.1, "{scale}");
+        assert_eq!(zero, 64);
+        let negative: u64 = histogram.counts[..HALF].iter().sum();
+        assert_eq!(negative, 40);
     }
 }

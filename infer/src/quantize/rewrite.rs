@@ -143,7 +143,9 @@ impl<'a> Layer<'a> {
         let channels = weights.dims[0] as usize;
         let (levels, scales) = weights_to_int8(&values, channels, offsets.as_deref(), input_scale);
         let bias = bias.zip(offsets).map(|(tensor, offsets)| {
-            let steps: Vec<f32> = scales.iter().map(|s| s * input_scale).collect();
+            let steps: Vec<f32> = (scales.iter())
+                .map(|s| (s * input_scale).max(f32::MIN_POSITIVE))
+                .collect();
             let levels = (offsets.iter().zip(&steps))
                 .map(|(b, step)| (f64::from(*b) / f64::from(*step)).round() as i32)
                 .collect();
