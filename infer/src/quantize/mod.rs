@@ -20,7 +20,7 @@ mod rewrite;
 
 use barchan_datasets::{DataError, StereoFrame};
 use barchan_onnx::Message;
-use barchan_onnx::proto::{Model, StringStringEntry};
+use barchan_onnx::proto::{Graph, Model, StringStringEntry};
 
 use crate::{InferError, Runtime};
 
@@ -124,14 +124,14 @@ pub fn quantize(
 }
 
 /// The messages of a file, if nothing of it would be lost.
-fn read(bytes: &[u8]) -> Result<(Model, barchan_onnx::proto::Graph), QuantizeError> {
+fn read(bytes: &[u8]) -> Result<(Model, Graph), QuantizeError> {
     let cure = "cure: give a float file that `barchan export` wrote";
     let wrong = |what: String| QuantizeError::Model(format!("{what}\n  {cure}"));
     let mut model = Model::decode(bytes).map_err(|e| wrong(format!("not an ONNX file: {e}")))?;
-    let quantized = |op: &str| op.contains("QuantizeLinear") || op.contains("DequantizeLinear");
-    if let Some(node) = (model.graph.iter().flat_map(|g| &g.node)).find(|n| {
-        quantized(&n.op_type) || n.op_type.contains("QLinear") || n.op_type.contains("Integer")
-    }) {
+    let marks = ["QuantizeLinear", "DequantizeLinear", "QLinear", "Integer"];
+    if let Some(node) = (model.graph.iter().flat_map(|g| &g.node))
+        .find(|n| marks.iter().any(|mark| n.op_type.contains(mark)))
+    {
         return Err(wrong(format!(
             "already quantised: node {} is {}",
             node.name, node.op_type
