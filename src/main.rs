@@ -54,7 +54,7 @@ fn main() -> ExitCode {
     let runtime = cli.onnxruntime.as_deref();
     let result = match cli.command {
         Command::Train(args) => commands::train::run(args, &output),
-        Command::Export(args) => commands::export::run(args, &output),
+        Command::Export(args) => commands::export::run(args, &output, runtime),
         Command::Infer(args) => commands::infer::run(args, &output, runtime),
         Command::Slam(args) => commands::slam::run(args, &output, runtime),
         Command::Map(args) => commands::map::run(args, &output),

@@ -3,7 +3,8 @@
 //! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
 //! line see disparity, whoever makes it; [`SemiGlobal`] and [`BlockMatching`], which need no model;
 //! [`Rejection`], which marks as unknown what the pair itself
-//! contradicts. Engines stand behind features: `burn`, `onnxruntime`.
+//! contradicts. Engines stand behind features: `burn`, `onnxruntime`. With the
+//! latter, `quantize` makes an int8 network out of a float one.
 //!
 //! What it promises: any image size; disparity positive (`x_right = x_left - d`), NaN is unknown.
 //!
@@ -15,6 +16,8 @@ mod classical;
 mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
+#[cfg(feature = "onnxruntime")]
+mod quantize;
 mod rejection;
 
 #[cfg(feature = "burn")]
@@ -23,4 +26,6 @@ pub use classical::{BlockMatching, SemiGlobal};
 pub use engine::{DisparityEngine, DisparityMap, InferError};
 #[cfg(feature = "onnxruntime")]
 pub use onnxruntime::{OnnxEngine, Runtime};
+#[cfg(feature = "onnxruntime")]
+pub use quantize::{QuantizeError, QuantizeOptions, Quantized, quantize};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};

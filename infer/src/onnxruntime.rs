@@ -19,7 +19,7 @@ static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
 
 /// A loaded ONNX Runtime.
 pub struct Runtime {
-    environment: Environment,
+    pub(crate) environment: Environment,
     path: PathBuf,
 }
 

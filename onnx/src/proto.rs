@@ -130,6 +130,9 @@ pub struct Tensor {
 }
 
 pub const FLOAT: i32 = 1;
+const UINT8: i32 = 2;
+const INT8: i32 = 3;
+const INT32: i32 = 6;
 const INT64: i32 = 7;
 
 impl Tensor {
@@ -148,6 +151,34 @@ impl Tensor {
             data_type: INT64,
             raw_data: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
         }
+    }
+    pub fn uint8s(name: &str, dims: &[usize], values: impl IntoIterator<Item = u8>) -> Self {
+        Self {
+            data_type: UINT8,
+            raw_data: values.into_iter().collect(),
+            ..Self::floats(name, dims, [])
+        }
+    }
+    pub fn int8s(name: &str, dims: &[usize], values: impl IntoIterator<Item = i8>) -> Self {
+        Self {
+            data_type: INT8,
+            raw_data: values.into_iter().map(i8::cast_unsigned).collect(),
+            ..Self::floats(name, dims, [])
+        }
+    }
+    pub fn int32s(name: &str, dims: &[usize], values: impl IntoIterator<Item = i32>) -> Self {
+        Self {
+            data_type: INT32,
+            raw_data: values.into_iter().flat_map(i32::to_le_bytes).collect(),
+            ..Self::floats(name, dims, [])
+        }
+    }
+    /// The values of a float tensor whose data are raw and as many as its dimensions say.
+    pub fn to_floats(&self) -> Option<Vec<f32>> {
+        let (values, rest) = self.raw_data.as_chunks::<4>();
+        let count = (self.dims.iter()).try_fold(1i64, |n, d| n.checked_mul(*d).filter(|_| *d >= 0));
+        (self.data_type == FLOAT && rest.is_empty() && count == i64::try_from(values.len()).ok())
+            .then(|| values.iter().map(|v| f32::from_le_bytes(*v)).collect())
     }
 }
 
@@ -188,6 +219,18 @@ pub struct Dimension {
 }
 
 impl ValueInfo {
+    /// A float tensor of which not even the rank is told.
+    pub fn float_of_any_shape(name: &str) -> Self {
+        Self {
+            name: name.into(),
+            kind: Some(Type {
+                tensor: Some(TensorType {
+                    elem_type: FLOAT,
+                    shape: None,
+                }),
+            }),
+        }
+    }
     /// A float tensor; a dimension that is no number is a free one of that name.
     pub fn float(name: &str, dims: [&str; 4]) -> Self {
         let dim = dims
