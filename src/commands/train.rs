@@ -141,10 +141,11 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         bar.inc(1);
         if bar.is_hidden() && (line.step.is_multiple_of(50) || line.step == total) {
             output.say(&format!(
-                "step {}/{total}  loss {:.4}  {:.2} s/step",
+                "step {}/{total}  loss {:.4}  {:.2} s/step  {}",
                 line.step,
                 line.loss,
-                seconds / steps as f64
+                seconds / steps as f64,
+                line.terms
             ));
         }
     });

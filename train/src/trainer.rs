@@ -169,7 +169,9 @@ impl Trainer {
         init: Option<StereoNet>,
     ) -> Result<Self, TrainError> {
         config.check()?;
-        let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, sources)?;
+        // What cannot be trained on leaves no run behind.
+        let pool = Pool::new(sources, &config)?;
+        let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, pool)?;
         if let Some(init) = init {
             trainer.net = init;
         }
@@ -187,7 +189,8 @@ impl Trainer {
     ) -> Result<Self, TrainError> {
         let (run, config) = RunDir::open(root)?;
         config.check()?;
-        let mut trainer = Self::prepare(run, config, sources)?;
+        let pool = Pool::new(sources, &config)?;
+        let mut trainer = Self::prepare(run, config, pool)?;
         if let Some(init) = init {
             trainer.net = init;
         }
@@ -201,12 +204,7 @@ impl Trainer {
         Ok(trainer)
     }
 
-    fn prepare(
-        run: RunDir,
-        config: TrainConfig,
-        sources: Vec<Box<dyn StereoSource>>,
-    ) -> Result<Self, TrainError> {
-        let pool = Arc::new(Pool::new(sources, &config)?);
+    fn prepare(run: RunDir, config: TrainConfig, pool: Pool) -> Result<Self, TrainError> {
         let (training, held_out) = split(pool.len());
         let device = config.device.device().autodiff();
         let net = StereoNet::init(&config.net, config.seed, &device)?;
@@ -218,7 +216,7 @@ impl Trainer {
             config,
             run,
             device,
-            pool,
+            pool: Arc::new(pool),
             net,
             optimizer,
             training,

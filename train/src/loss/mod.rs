@@ -27,6 +27,8 @@ pub use occlusion::visible;
 pub use photometric::{structural_dissimilarity, warp_right_to_left};
 pub use smoothness::{edge_aware_smoothness, second_order_smoothness};
 
+use std::fmt::{Display, Formatter};
+
 use barchan_model::StereoNet;
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -379,6 +381,36 @@ impl LossTerms<Tensor<1>> {
             visible: either(self.visible, other.visible),
             from_neighbours: either(self.from_neighbours, other.from_neighbours),
         }
+    }
+}
+
+impl Display for LossTerms {
+    /// `ssim 0.1234  l1 0.0345 ...`, without those that are off.
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let options = [
+            ("second order", self.second_order),
+            ("census", self.census),
+            ("proxies", self.proxies),
+            ("visible", self.visible),
+            ("from neighbours", self.from_neighbours),
+        ];
+        let Self {
+            ssim,
+            l1,
+            smooth,
+            magnitude,
+            ..
+        } = self;
+        write!(
+            f,
+            "ssim {ssim:.4}  l1 {l1:.4}  smooth {smooth:.4}  magnitude {magnitude:.4}"
+        )?;
+        for (name, value) in options {
+            if let Some(value) = value {
+                write!(f, "  {name} {value:.4}")?;
+            }
+        }
+        Ok(())
     }
 }
 

@@ -122,6 +122,7 @@ pub fn projection(
 mod tests {
     use super::*;
     use crate::loss::checks::{gradient_error, map, pixels};
+    use crate::loss::masked_mean;
     use barchan_datasets::{StereoSource, Synth, planar};
     use burn::tensor::{Device, TensorData};
 
@@ -167,15 +168,14 @@ mod tests {
         let disparity = disparity.clone().mask_fill(disparity.is_nan(), 1.0);
         let left = image(&now.left).narrow(2, y0, h).narrow(3, x0, w);
         let error = |pose: &Se3| {
-            let n = neighbour(
-                image(&next.left),
-                projection(synth.rig(), pose, [x0, y0], added),
-            );
+            let next = image(&next.left);
+            let n = neighbour(next, projection(synth.rig(), pose, [x0, y0], added));
             let (warped, seen) = n.warp(&disparity);
-            let seen = seen * known.clone();
-            let difference = (warped - left.clone()).abs().mean_dim(1) * seen.clone();
-            (difference.sum() / seen.clone().sum()).into_scalar::<f32>()
-                / seen.mean().into_scalar::<f32>().min(0.7)
+            let difference =
+                masked_mean((warped - left.clone()).abs(), seen.clone() * known.clone());
+            let share = seen.mean().into_scalar::<f32>();
+            assert!(share > 0.7, "{share}");
+            difference.into_scalar::<f32>()
         };
         let (with, without) = (error(&T_next_now), error(&Se3::identity()));
         assert!(

@@ -206,6 +206,25 @@ fn a_mirrored_pair_has_the_loss_of_the_pair() {
 }
 
 #[test]
+fn terms_that_are_off_are_neither_printed_nor_logged() {
+    let plain = LossTerms {
+        ssim: 0.25,
+        ..LossTerms::default()
+    };
+    assert_eq!(
+        plain.to_string(),
+        "ssim 0.2500  l1 0.0000  smooth 0.0000  magnitude 0.0000"
+    );
+    let census = LossTerms {
+        census: Some(0.5),
+        ..plain.clone()
+    };
+    assert_eq!(census.to_string(), format!("{plain}  census 0.5000"));
+    assert!(!serde_json::to_string(&plain).unwrap().contains("census"));
+    assert!(serde_json::to_string(&census).unwrap().contains("census"));
+}
+
+#[test]
 fn nonsense_weights_and_options_without_effect_are_refused() {
     let refused = |loss: Loss, supervised: bool| loss.check(supervised).unwrap_err().to_string();
     let nan = Loss {
@@ -269,7 +288,7 @@ fn loss_with(change: fn(&mut Loss)) -> Loss {
 
 /// Trains a random network on one frame, uncropped and untouched, so that steps compare.
 fn train(change: fn(&mut Loss)) -> Vec<LogLine> {
-    let data = "seed=5,frames=3,width=96,height=64".to_owned();
+    let data = "seed=5,frames=2,width=96,height=64".to_owned();
     let dir = tempfile::tempdir().unwrap();
     let config = TrainConfig {
         data: vec![format!("synth:{data}")],
@@ -277,7 +296,7 @@ fn train(change: fn(&mut Loss)) -> Vec<LogLine> {
         device: DeviceName::Flex,
         seed: 1,
         supervised: false,
-        batch: 2,
+        batch: 1,
         crop: [64, 96],
         checkpoint_every: 100,
         net: NetConfig {
@@ -285,7 +304,7 @@ fn train(change: fn(&mut Loss)) -> Vec<LogLine> {
             ..Preset::Tiny.config()
         },
         schedule: Schedule {
-            epochs: 8,
+            epochs: 10,
             ..Schedule::PRETRAIN
         },
         loss: loss_with(change),
