@@ -171,7 +171,7 @@ fn check_poses(trajectory: Option<&Trajectory>) -> Result<(), &'static str> {
 }
 
 impl StereoSource for Pool {
-    /// That of the first source; training looks at images only.
+    /// That of the first source.
     fn rig(&self) -> &RectifiedRig {
         self.sources[0].rig()
     }

@@ -127,12 +127,16 @@ impl TrainConfig {
 pub struct Validation {
     /// How many pairs were held out.
     pub frames: usize,
-    /// The photometric part of eq. 1, `a1 L_SSIM + a2 L_1`, mean over pairs.
+    /// The photometric part of the loss, `a1 L_SSIM + a2 L_1` and the weighted census term where that
+    /// is on, mean over pairs; whole images, without options that choose pixels.
     pub photometric: f32,
     /// Mean (1 - SSIM) / 2.
     pub ssim: f32,
     /// Mean absolute difference.
     pub l1: f32,
+    /// Mean census distance, where that is part of the loss.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub census: Option<f32>,
 }
 
 /// What a checkpoint remembers beside weights and optimiser.
@@ -345,7 +349,7 @@ impl Trainer {
     pub fn validate(&self) -> Result<Validation, TrainError> {
         let net = self.net.valid();
         let device = self.device.clone().inner();
-        let (mut ssim, mut l1) = (0.0, 0.0);
+        let (mut ssim, mut l1, mut census) = (0.0, 0.0, 0.0);
         for frame in prefetch(self.pool.clone(), self.held_out.clone(), 2) {
             let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame?, &device);
             let disparity = net.forward(left.clone(), right.clone()).disparity;
@@ -354,15 +358,17 @@ impl Trainer {
             let terms = terms.values();
             ssim += terms.ssim;
             l1 += terms.l1;
+            census += terms.census.unwrap_or(0.0);
         }
         let n = self.held_out.len() as f32;
-        let (ssim, l1) = (ssim / n, l1 / n);
-        let photometric = self.config.loss.ssim * ssim + self.config.loss.l1 * l1;
+        let (ssim, l1, census) = (ssim / n, l1 / n, census / n);
+        let weights = &self.config.loss;
         Ok(Validation {
             frames: self.held_out.len(),
-            photometric,
+            photometric: weights.ssim * ssim + weights.l1 * l1 + weights.census * census,
             ssim,
             l1,
+            census: (weights.census > 0.0).then_some(census),
         })
     }
 

@@ -4,9 +4,11 @@ use burn::tensor::Tensor;
 
 use super::checks::{between_pixels, device, gradient_error, map, waves};
 use super::*;
-use crate::{Augmentation, DeviceName, LogLine, Schedule, TrainConfig, Trainer};
+use crate::{Augmentation, DeviceName, LogLine, Schedule, TrainConfig, Trainer, Validation};
 
-/// Photometric, smoothness and magnitude terms off.
+type Change = fn(&mut Loss);
+
+/// Every term off.
 const NOTHING: Loss = Loss {
     ssim: 0.0,
     l1: 0.0,
@@ -42,7 +44,7 @@ fn only(image: &Tensor<4>, from: usize, to: usize) -> Tensor<4> {
 
 #[test]
 fn gradient_of_every_term_matches_finite_differences() {
-    let only_weight = |change: fn(&mut Loss)| {
+    let only_weight = |change: Change| {
         let mut loss = NOTHING;
         change(&mut loss);
         loss
@@ -247,10 +249,12 @@ fn nonsense_weights_and_options_without_effect_are_refused() {
 
 #[test]
 fn a_few_steps_with_each_option_lower_its_loss() {
-    let options: [(&str, fn(&mut Loss)); 7] = [
+    let options: [(&str, Change); 7] = [
         ("none", |_| ()),
         ("second order", |l| l.second_order = 0.1),
-        ("census", |l| l.census = 0.5),
+        ("census alone", |l| {
+            (l.ssim, l.l1, l.census) = (0.0, 0.0, 1.0)
+        }),
         ("occlusion", |l| l.occlusion = Some(1.0)),
         ("symmetric", |l| {
             (l.symmetric, l.occlusion) = (true, Some(1.0));
@@ -259,10 +263,15 @@ fn a_few_steps_with_each_option_lower_its_loss() {
         ("proxies", |l| l.proxies = 0.1),
     ];
     for (name, change) in options {
-        let lines = train(change);
+        let (lines, [before, after]) = train(change);
         let [first, last] = [&lines[0], &lines[lines.len() - 1]];
         assert!(last.loss < 0.97 * first.loss, "{name}: {first:?} {last:?}");
+        assert!(
+            after.photometric < before.photometric,
+            "{name}: {before:?} {after:?}"
+        );
         let (t, l) = (&last.terms, loss_with(change));
+        assert_eq!(after.census.is_some(), l.census > 0.0, "{name}");
         let logged = [
             (t.second_order, l.second_order > 0.0),
             (t.census, l.census > 0.0),
@@ -280,14 +289,14 @@ fn a_few_steps_with_each_option_lower_its_loss() {
     }
 }
 
-fn loss_with(change: fn(&mut Loss)) -> Loss {
+fn loss_with(change: Change) -> Loss {
     let mut loss = Loss::default();
     change(&mut loss);
     loss
 }
 
 /// Trains a random network on one frame, uncropped and untouched, so that steps compare.
-fn train(change: fn(&mut Loss)) -> Vec<LogLine> {
+fn train(change: Change) -> (Vec<LogLine>, [Validation; 2]) {
     let data = "seed=5,frames=2,width=96,height=64".to_owned();
     let dir = tempfile::tempdir().unwrap();
     let config = TrainConfig {
@@ -319,6 +328,6 @@ fn train(change: fn(&mut Loss)) -> Vec<LogLine> {
     let source: Box<dyn StereoSource> = Box::new(Synth::parse(&data).unwrap());
     let mut trainer = Trainer::create(&dir.path().join("run"), config, vec![source], None).unwrap();
     let mut lines = vec![];
-    trainer.run(|line| lines.push(line.clone())).unwrap();
-    lines
+    let (before, after) = trainer.run(|line| lines.push(line.clone())).unwrap();
+    (lines, [before, after])
 }
