@@ -4,13 +4,17 @@ use burn::tensor::Tensor;
 
 use super::masked_mean;
 
-/// Smooth L1 (eq. 8) of `disparity - truth` where `known` is 1, in pixels; all `[B, 1, H, W]`.
+/// The mean of [`smooth_l1`] where `known` is 1; all `[B, 1, H, W]`.
 pub fn supervised(disparity: &Tensor<4>, truth: &Tensor<4>, known: &Tensor<4>) -> Tensor<1> {
+    masked_mean(smooth_l1(disparity, truth), known.clone())
+}
+
+/// Smooth L1 (eq. 8) of `disparity - truth`, pixel by pixel, in pixels.
+pub fn smooth_l1(disparity: &Tensor<4>, truth: &Tensor<4>) -> Tensor<4> {
     let error = (disparity.clone() - truth.clone()).abs();
     let near = error.clone().clamp_max(1.0);
     // 0.5 e^2 below one pixel and e - 0.5 above, without a branch.
-    let loss = near.clone().square() * 0.5 + (error - near);
-    masked_mean(loss, known.clone())
+    near.clone().square() * 0.5 + (error - near)
 }
 
 #[cfg(test)]

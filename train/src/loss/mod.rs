@@ -21,7 +21,7 @@ mod photometric;
 mod smoothness;
 
 pub use census::census_distance;
-pub use known::supervised;
+pub use known::{smooth_l1, supervised};
 pub use neighbour::{Neighbour, projection};
 pub use occlusion::visible;
 pub use photometric::{structural_dissimilarity, warp_right_to_left};
@@ -63,7 +63,8 @@ pub struct Loss {
     /// and each pixel is left to the image that explains it best; 0 is off. Their pictures are all that
     /// is looked at, of held-out frames too.
     pub neighbours: usize,
-    /// Weight of the distance (eq. 8) to disparity by semi-global matching, where left and right agree.
+    /// Weight of the distance (eq. 8) to disparity by semi-global matching, where left and right agree and
+    /// it explains the image better than the network does.
     pub proxies: f32,
 }
 
@@ -102,7 +103,7 @@ pub struct LossTerms<T = f32> {
     /// Mean census distance, 0 to 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub census: Option<T>,
-    /// Smooth L1 to the disparity of semi-global matching, pixels.
+    /// Smooth L1 to the disparity of semi-global matching where that is the better, else zero, pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub proxies: Option<T>,
     /// Share of the pixels inside the right image that pass the left-right check.
@@ -253,6 +254,14 @@ impl Loss {
             None => inside.clone(),
         };
         let mut best = self.compare(&view.left, &warped, &view.right, seen);
+        let proxies = view.proxies.as_ref().map(|[proxy, known]| {
+            // A proxy is a hint (Watson 2019, eq. 4): it holds where it explains the image better than
+            // the network does, and lets go where the network has become the finer of the two.
+            let (warped, inside) = warp_right_to_left(&view.right, proxy);
+            let hint = self.compare(&view.left, &warped, &view.right, inside);
+            let better = self.error(&hint).lower_equal(self.error(&best)).float();
+            masked_mean(smooth_l1(&view.disparity, proxy) * better, known.clone())
+        });
         for neighbour in &view.neighbours {
             let (warped, seen) = neighbour.warp(&view.disparity);
             let other = self.compare(&view.left, &warped, &neighbour.image, seen);
@@ -269,10 +278,7 @@ impl Loss {
             second_order: (self.second_order > 0.0)
                 .then(|| second_order_smoothness(&view.left, &share)),
             census: best.census.map(|census| mean(census, census::REACH)),
-            proxies: view
-                .proxies
-                .as_ref()
-                .map(|[disparity, known]| supervised(&view.disparity, disparity, known)),
+            proxies,
             visible: visible.map(|visible| masked_mean(visible, inside)),
             from_neighbours: best.from_neighbours.map(|from| mean(from, 0)),
         }
@@ -294,26 +300,28 @@ impl Loss {
         }
     }
 
-    /// Pixel by pixel the comparison whose weighted photometric error is less (Godard 2019, eq. 4);
-    /// `b` is of a neighbouring image.
-    fn better(&self, a: Comparison, b: Comparison) -> Comparison {
-        let error = |of: &Comparison| {
-            // A windowed term knows nothing of the border: the next pixel stands for it.
-            let grow = |x: &Tensor<4>, by: usize| {
-                x.clone()
-                    .detach()
-                    .mean_dim(1)
-                    .pad((by, by, by, by), PadMode::Edge)
-            };
-            let error = grow(&of.ssim, 1) * self.ssim + grow(&of.l1, 0) * self.l1;
-            let error = match &of.census {
-                Some(census) => error + grow(census, census::REACH) * self.census,
-                None => error,
-            };
-            // Beyond any error of what is seen.
-            error + (-of.seen.clone() + 1.0) * 1e6
+    /// The weighted photometric error of each pixel, `[B, 1, H, W]`, without gradient.
+    fn error(&self, of: &Comparison) -> Tensor<4> {
+        // A windowed term knows nothing of the border: the next pixel stands for it.
+        let grow = |x: &Tensor<4>, by: usize| {
+            x.clone()
+                .detach()
+                .mean_dim(1)
+                .pad((by, by, by, by), PadMode::Edge)
         };
-        let b_is_better = error(&b).lower(error(&a)).float();
+        let error = grow(&of.ssim, 1) * self.ssim + grow(&of.l1, 0) * self.l1;
+        let error = match &of.census {
+            Some(census) => error + grow(census, census::REACH) * self.census,
+            None => error,
+        };
+        // Beyond any error of what is seen.
+        error + (-of.seen.clone() + 1.0) * 1e6
+    }
+
+    /// Pixel by pixel the comparison whose error is less (Godard 2019, eq. 4); `b` is of a neighbouring
+    /// image.
+    fn better(&self, a: Comparison, b: Comparison) -> Comparison {
+        let b_is_better = self.error(&b).lower(self.error(&a)).float();
         let choose = |a: Tensor<4>, b: Tensor<4>, reach| {
             let b_is_better = shrink(&b_is_better, reach);
             a.clone() + (b - a) * b_is_better
