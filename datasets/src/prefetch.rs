@@ -10,21 +10,31 @@ use crate::{DataError, StereoFrame, StereoSource};
 /// A frame that cannot be read is an `Err` in its place and the iterator goes on. Dropping it
 /// stops the threads, each after the frame in hand.
 pub fn prefetch(source: Arc<dyn StereoSource>, order: Vec<usize>, ahead: usize) -> Prefetch {
+    prefetch_with(move |index| source.frame(index), order, ahead)
+}
+
+/// The same for whatever else is made of a frame's index: `read` runs on the threads.
+pub fn prefetch_with<T: Send + 'static, E: From<DataError> + Send + 'static>(
+    read: impl Fn(usize) -> Result<T, E> + Send + Sync + 'static,
+    order: Vec<usize>,
+    ahead: usize,
+) -> Prefetch<T, E> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = cores.min(4).min(ahead).max(1);
     // A thread holds one finished frame in hand besides those in its channel.
     let queued = (ahead / threads).saturating_sub(1);
     let order: Arc<[usize]> = order.into();
+    let read = Arc::new(read);
     // Thread k reads every threads-th frame from the k-th into a channel of its own, so that
     // taking from the channels in turn restores the order.
     let (channels, workers) = (0..threads)
         .map(|k| {
             let (send, receive) = sync_channel(queued);
-            let (source, order) = (Arc::clone(&source), Arc::clone(&order));
+            let (read, order) = (Arc::clone(&read), Arc::clone(&order));
             let worker = std::thread::spawn(move || {
                 for index in order.iter().skip(k).step_by(threads) {
                     // The receiver is gone: nobody wants more.
-                    if send.send(source.frame(*index)).is_err() {
+                    if send.send(read(*index)).is_err() {
                         return;
                     }
                 }
@@ -40,16 +50,16 @@ pub fn prefetch(source: Arc<dyn StereoSource>, order: Vec<usize>, ahead: usize) 
     }
 }
 
-/// What [`prefetch`] returns.
-pub struct Prefetch {
-    channels: Vec<Receiver<Result<StereoFrame, DataError>>>,
+/// What [`prefetch`] and [`prefetch_with`] return.
+pub struct Prefetch<T = StereoFrame, E = DataError> {
+    channels: Vec<Receiver<Result<T, E>>>,
     workers: Vec<JoinHandle<()>>,
     order: Arc<[usize]>,
     next: usize,
 }
 
-impl Iterator for Prefetch {
-    type Item = Result<StereoFrame, DataError>;
+impl<T, E: From<DataError>> Iterator for Prefetch<T, E> {
+    type Item = Result<T, E>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let index = *self.order.get(self.next)?;
@@ -59,7 +69,8 @@ impl Iterator for Prefetch {
             Err(DataError::Layout {
                 spec: format!("frame {index}"),
                 message: "the thread that reads it has stopped; please report this".into(),
-            })
+            }
+            .into())
         }))
     }
 
@@ -69,9 +80,9 @@ impl Iterator for Prefetch {
     }
 }
 
-impl ExactSizeIterator for Prefetch {}
+impl<T, E: From<DataError>> ExactSizeIterator for Prefetch<T, E> {}
 
-impl Drop for Prefetch {
+impl<T, E> Drop for Prefetch<T, E> {
     fn drop(&mut self) {
         self.channels.clear();
         for worker in self.workers.drain(..) {

@@ -1,15 +1,18 @@
+mod loss_args;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 use barchan_datasets::StereoSource;
 use barchan_model::{NetConfig, Preset, StereoNet};
-use barchan_train::{Augmentation, DeviceName, Loss, RunDir, Schedule, TrainConfig, Trainer};
+use barchan_train::{Augmentation, DeviceName, RunDir, Schedule, TrainConfig, Trainer};
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
 
 use crate::data::{Unchecked, open_checked};
 use crate::engine::load_net;
 use crate::output::Output;
+use loss_args::LossArgs;
 
 /// Train the stereo network on images alone
 #[derive(Parser)]
@@ -69,18 +72,6 @@ pub struct Args {
     /// Largest disparity searched, pixels, a multiple of 16 [default: the preset's]
     #[arg(long)]
     max_disparity: Option<usize>,
-    /// Weight of the structural term, eq. 2
-    #[arg(long, default_value_t = Loss::default().ssim)]
-    ssim: f32,
-    /// Weight of the colour term, eq. 3
-    #[arg(long, default_value_t = Loss::default().l1)]
-    l1: f32,
-    /// Weight of the smoothness term, eq. 4
-    #[arg(long, default_value_t = Loss::default().smooth)]
-    smooth: f32,
-    /// Weight of the disparity-magnitude term, eq. 5
-    #[arg(long, default_value_t = Loss::default().magnitude)]
-    magnitude: f32,
     /// Augmentation: standard deviation of the noise
     #[arg(long, default_value_t = Augmentation::default().noise)]
     noise: f32,
@@ -98,6 +89,8 @@ pub struct Args {
     add_disparity: Option<usize>,
     #[command(flatten)]
     unchecked: Unchecked,
+    #[command(flatten)]
+    loss: LossArgs,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -162,10 +155,11 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         bar.inc(1);
         if bar.is_hidden() && (line.step.is_multiple_of(50) || line.step == total) {
             output.say(&format!(
-                "step {}/{total}  loss {:.4}  {:.2} s/step",
+                "step {}/{total}  loss {:.4}  {:.2} s/step  {}",
                 line.step,
                 line.loss,
-                seconds / steps as f64
+                seconds / steps as f64,
+                line.terms
             ));
         }
     });
@@ -240,12 +234,7 @@ fn create(args: &Args, root: &Path, output: &Output) -> Result<Trainer> {
             drop_epoch: args.drop_epoch.unwrap_or(schedule.drop_epoch),
             steps: args.steps,
         },
-        loss: Loss {
-            ssim: args.ssim,
-            l1: args.l1,
-            smooth: args.smooth,
-            magnitude: args.magnitude,
-        },
+        loss: args.loss.loss(),
         augmentation: Augmentation {
             noise: args.noise,
             brightness: args.brightness,

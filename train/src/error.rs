@@ -1,6 +1,7 @@
 use std::path::PathBuf;
 
 use barchan_datasets::DataError;
+use barchan_infer::InferError;
 use barchan_model::ModelError;
 
 /// Why training cannot start or go on.
@@ -12,6 +13,9 @@ pub enum TrainError {
     /// The network cannot be made, read or written.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// Semi-global matching fails on a pair.
+    #[error(transparent)]
+    Proxies(#[from] InferError),
     /// A file of the run directory.
     #[error("{path}: {message}")]
     Run {

@@ -1,6 +1,7 @@
 //! Training without ground truth (and with it, for pretraining on renders).
 //!
-//! What it is for: [`Loss`] is eq. 1-5 of Hong 2021 term by term, [`Trainer`] runs them over
+//! What it is for: [`Loss`] is eq. 1-5 of Hong 2021 term by term, with options of later work (see
+//! [`mod@loss`]), [`Trainer`] runs them over
 //! stereo sources, [`RunDir`] is what a run leaves on disk.
 //!
 //! What it promises: the same configuration, data and machine give the same weights; a run that

@@ -7,7 +7,7 @@ use burn::optim::ModuleOptimizer;
 use burn::store::ModuleRecord;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::{TrainConfig, TrainError};
+use crate::{LossTerms, TrainConfig, TrainError};
 
 /// What a run leaves on disk: `config.toml`, `log.jsonl`, `weights.safetensors`, `summary.json`,
 /// and under `checkpoints/` what it needs to go on.
@@ -29,14 +29,9 @@ pub struct LogLine {
     pub lr: f64,
     /// Weighted loss (eq. 1, or eq. 8 when supervised).
     pub loss: f32,
-    /// Mean (1 - SSIM) / 2.
-    pub ssim: f32,
-    /// Mean absolute difference.
-    pub l1: f32,
-    /// Smoothness.
-    pub smooth: f32,
-    /// Magnitude.
-    pub magnitude: f32,
+    /// The terms, unweighted; those that are off are absent.
+    #[serde(flatten)]
+    pub terms: LossTerms,
     /// Seconds the step took.
     pub seconds: f64,
 }

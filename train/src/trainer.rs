@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::batch::Sample;
-use crate::loss::{self, Loss};
+use crate::loss::{self, Loss, View};
 use crate::pool::Pool;
 use crate::{Augmentation, Batch, LogLine, RunDir, TrainError};
 
@@ -94,7 +94,7 @@ pub struct TrainConfig {
     pub net: NetConfig,
     /// How long and how fast.
     pub schedule: Schedule,
-    /// Weights of eq. 1.
+    /// Weights of eq. 1, and its options.
     pub loss: Loss,
     /// What is done to the images that the network sees.
     pub augmentation: Augmentation,
@@ -108,6 +108,7 @@ impl TrainConfig {
     pub fn check(&self) -> Result<(), TrainError> {
         let refuse = |message: &str| Err(TrainError::Config(message.into()));
         self.net.check()?;
+        self.loss.check(self.supervised)?;
         if self.batch == 0 || self.checkpoint_every == 0 || self.schedule.epochs == 0 {
             return refuse("batch, checkpoint_every and epochs must be at least 1");
         }
@@ -126,12 +127,16 @@ impl TrainConfig {
 pub struct Validation {
     /// How many pairs were held out.
     pub frames: usize,
-    /// The photometric part of eq. 1, `a1 L_SSIM + a2 L_1`, mean over pairs.
+    /// The photometric part of the loss, `a1 L_SSIM + a2 L_1` and the weighted census term where that
+    /// is on, mean over pairs; whole images, without options that choose pixels.
     pub photometric: f32,
     /// Mean (1 - SSIM) / 2.
     pub ssim: f32,
     /// Mean absolute difference.
     pub l1: f32,
+    /// Mean census distance, where that is part of the loss.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub census: Option<f32>,
 }
 
 /// What a checkpoint remembers beside weights and optimiser.
@@ -168,7 +173,9 @@ impl Trainer {
         init: Option<StereoNet>,
     ) -> Result<Self, TrainError> {
         config.check()?;
-        let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, sources)?;
+        // What cannot be trained on leaves no run behind.
+        let pool = Pool::new(sources, &config)?;
+        let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, pool)?;
         if let Some(init) = init {
             trainer.net = init;
         }
@@ -186,7 +193,8 @@ impl Trainer {
     ) -> Result<Self, TrainError> {
         let (run, config) = RunDir::open(root)?;
         config.check()?;
-        let mut trainer = Self::prepare(run, config, sources)?;
+        let pool = Pool::new(sources, &config)?;
+        let mut trainer = Self::prepare(run, config, pool)?;
         if let Some(init) = init {
             trainer.net = init;
         }
@@ -200,12 +208,7 @@ impl Trainer {
         Ok(trainer)
     }
 
-    fn prepare(
-        run: RunDir,
-        config: TrainConfig,
-        sources: Vec<Box<dyn StereoSource>>,
-    ) -> Result<Self, TrainError> {
-        let pool = Arc::new(Pool::new(sources)?);
+    fn prepare(run: RunDir, config: TrainConfig, pool: Pool) -> Result<Self, TrainError> {
         let (training, held_out) = split(pool.len());
         let device = config.device.device().autodiff();
         let net = StereoNet::init(&config.net, config.seed, &device)?;
@@ -217,7 +220,7 @@ impl Trainer {
             config,
             run,
             device,
-            pool,
+            pool: Arc::new(pool),
             net,
             optimizer,
             training,
@@ -266,14 +269,12 @@ impl Trainer {
             let epoch = self.step / self.steps_per_epoch();
             let order = self.epoch_order(epoch);
             let rest = order[(self.step % self.steps_per_epoch()) * self.config.batch..].to_vec();
-            let mut frames = prefetch(self.pool.clone(), rest, ahead);
+            let mut read = self.pool.prefetch(rest, ahead);
             while self.step < total && self.step / self.steps_per_epoch() == epoch {
-                let mut samples: Vec<Sample> = Vec::with_capacity(self.config.batch);
-                for frame in frames.by_ref().take(self.config.batch) {
-                    let frame = frame?;
-                    let truth = self.truth_of(frame.index)?;
-                    samples.push((frame, truth));
-                }
+                let samples: Vec<Sample> = read
+                    .by_ref()
+                    .take(self.config.batch)
+                    .collect::<Result<_, _>>()?;
                 if samples.is_empty() {
                     break;
                 }
@@ -301,27 +302,22 @@ impl Trainer {
             &self.device,
         );
 
-        let prediction = self.net.forward_training(batch.seen_left, batch.seen_right);
-        let terms =
-            self.config
-                .loss
-                .self_supervised(&batch.left, &batch.right, &prediction.disparity);
-        let total = match (&batch.truth, self.config.supervised) {
-            (Some((truth, known)), true) => {
-                // What the network cannot say it is not asked.
-                let reachable = truth
-                    .clone()
-                    .lower_equal_scalar((self.config.net.max_disparity - 2) as f32)
-                    .float();
-                loss::supervised(&prediction.disparity, truth, &(known.clone() * reachable))
-            }
+        let (mut view, mirrored) = View::predict(&self.net, &batch, &self.config.loss);
+        // What the network cannot say it is not asked.
+        let most = (self.config.net.max_disparity - 2) as f32;
+        let reachable =
+            |[d, known]: [Tensor<4>; 2]| [d.clone(), known * d.lower_equal_scalar(most).float()];
+        view.proxies = view.proxies.map(reachable);
+        let (total, terms) = self.config.loss.self_supervised(&view, mirrored.as_ref());
+        let total = match (batch.truth.map(reachable), self.config.supervised) {
+            (Some([truth, known]), true) => loss::supervised(&view.disparity, &truth, &known),
             (None, true) => {
                 return Err(TrainError::Config(format!(
                     "--supervised: {} has no true disparity",
                     batch.names
                 )));
             }
-            (_, false) => terms.total.clone(),
+            (_, false) => total,
         };
         let value = total.clone().into_scalar::<f32>();
         if !value.is_finite() {
@@ -336,16 +332,12 @@ impl Trainer {
         self.net = self.optimizer.step(lr, self.net.clone(), gradients);
         self.step += 1;
 
-        let terms = terms.values();
         Ok(LogLine {
             step: self.step,
             epoch,
             lr,
             loss: value,
-            ssim: terms.ssim,
-            l1: terms.l1,
-            smooth: terms.smooth,
-            magnitude: terms.magnitude,
+            terms: terms.values(),
             seconds: started.elapsed().as_secs_f64(),
         })
     }
@@ -357,26 +349,26 @@ impl Trainer {
     pub fn validate(&self) -> Result<Validation, TrainError> {
         let net = self.net.valid();
         let device = self.device.clone().inner();
-        let (mut ssim, mut l1) = (0.0, 0.0);
+        let (mut ssim, mut l1, mut census) = (0.0, 0.0, 0.0);
         for frame in prefetch(self.pool.clone(), self.held_out.clone(), 2) {
             let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame?, &device);
             let disparity = net.forward(left.clone(), right.clone()).disparity;
-            let terms = self
-                .config
-                .loss
-                .self_supervised(&left, &right, &disparity)
-                .values();
+            let view = View::new(left, right, disparity);
+            let (_, terms) = self.config.loss.self_supervised(&view, None);
+            let terms = terms.values();
             ssim += terms.ssim;
             l1 += terms.l1;
+            census += terms.census.unwrap_or(0.0);
         }
         let n = self.held_out.len() as f32;
-        let (ssim, l1) = (ssim / n, l1 / n);
-        let photometric = self.config.loss.ssim * ssim + self.config.loss.l1 * l1;
+        let (ssim, l1, census) = (ssim / n, l1 / n, census / n);
+        let weights = &self.config.loss;
         Ok(Validation {
             frames: self.held_out.len(),
-            photometric,
+            photometric: weights.ssim * ssim + weights.l1 * l1 + weights.census * census,
             ssim,
             l1,
+            census: (weights.census > 0.0).then_some(census),
         })
     }
 
@@ -394,14 +386,6 @@ impl Trainer {
     /// The run directory.
     pub fn run_dir(&self) -> &RunDir {
         &self.run
-    }
-
-    fn truth_of(&self, index: usize) -> Result<Option<barchan_datasets::Plane>, TrainError> {
-        Ok(if self.config.supervised {
-            self.pool.true_disparity(index)?
-        } else {
-            None
-        })
     }
 
     fn steps_per_epoch(&self) -> usize {
