@@ -32,7 +32,7 @@ pub struct LossArgs {
     /// Compare with the left images N frames before and after, too; the data must know every pose [0: off]
     #[arg(long, value_name = "N", num_args = 0..=1, default_value_t = Loss::default().neighbours, default_missing_value = "1")]
     neighbours: usize,
-    /// Weight of the distance to disparity by semi-global matching, where that is sure (try 0.1)
+    /// Weight of the distance to disparity by semi-global matching, where that is sure and better (try 0.01)
     #[arg(long, value_name = "W", default_value_t = Loss::default().proxies)]
     proxies: f32,
 }
