@@ -22,5 +22,8 @@ pub use burn_engine::BurnEngine;
 pub use classical::{BlockMatching, SemiGlobal};
 pub use engine::{DisparityEngine, DisparityMap, InferError};
 #[cfg(feature = "onnxruntime")]
-pub use onnxruntime::{OnnxEngine, Runtime};
+pub use onnxruntime::{
+    Channels, Contract, ImageFormat, InputFormat, Layout, ModelSize, OnnxEngine, OutputFormat,
+    OutputLayout, Runtime, Side, Unit,
+};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};
