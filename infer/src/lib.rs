@@ -15,6 +15,8 @@ mod classical;
 mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
+#[cfg(feature = "onnxruntime")]
+mod probe;
 mod rejection;
 
 #[cfg(feature = "burn")]
@@ -26,4 +28,6 @@ pub use onnxruntime::{
     Channels, Contract, ImageFormat, InputFormat, Layout, ModelSize, OnnxEngine, OutputFormat,
     OutputLayout, Runtime, Side, Unit,
 };
+#[cfg(feature = "onnxruntime")]
+pub use probe::{Decision, Verdict, probe};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};

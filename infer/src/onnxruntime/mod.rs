@@ -21,7 +21,7 @@ pub(crate) use runtime::open;
 
 use crate::engine::check_sizes;
 use crate::{DisparityEngine, DisparityMap, InferError};
-use run::{Geometry, plane, run};
+use run::{Geometry, plane, resolution, run};
 
 /// Runs an ONNX file: one that `barchan export` wrote, or anybody's whose [`Contract`] lies beside it.
 ///
@@ -30,7 +30,7 @@ use run::{Geometry, plane, run};
 /// below a pixel times the similarity of the matched windows.
 pub struct OnnxEngine {
     session: Session,
-    contract: Contract,
+    pub(crate) contract: Contract,
     path: PathBuf,
 }
 
@@ -71,20 +71,16 @@ impl OnnxEngine {
                 path.display()
             )));
         };
-        Self::with_contract(session, contract, path)
+        Ok(Self::with_contract(session, contract, path))
     }
 
     /// An engine on a session that is open.
-    pub(crate) fn with_contract(
-        session: Session,
-        contract: Contract,
-        path: &Path,
-    ) -> Result<Self, InferError> {
-        Ok(Self {
+    pub(crate) fn with_contract(session: Session, contract: Contract, path: &Path) -> Self {
+        Self {
             session,
             contract,
             path: path.to_owned(),
-        })
+        }
     }
 
     /// How the file wants its images and what its output means.
@@ -123,6 +119,13 @@ impl OnnxEngine {
                         self.path.display()
                     ))
                 })?;
+            if resolution(contract, &geometry, columns_rows).is_none() {
+                return Err(failed(format!(
+                    "output \"{name}\" is {dims:?} for images of {:?}, which is no whole fraction\n  cure: `barchan probe {}`",
+                    geometry.given,
+                    self.path.display()
+                )));
+            }
             let values = geometry.to_image(&values, columns_rows, factor as f32);
             // One value a pixel by construction.
             Ok(Plane::from_raw(size.0, size.1, values).unwrap_or_default())

@@ -233,6 +233,22 @@ pub(crate) fn plane(
     Some(([columns.0, rows.0], values))
 }
 
+/// How many times smaller than the images a model was given its output is: 1, 2, 3 ... 32. Along a fixed
+/// side the last pixel of the output may reach beyond the image. Nothing when it is no whole fraction.
+pub(crate) fn resolution(
+    contract: &Contract,
+    geometry: &Geometry,
+    size: [usize; 2],
+) -> Option<usize> {
+    let fixed = [contract.size.width, contract.size.height];
+    (1..=32).find(|times| {
+        (0..2).all(|axis| {
+            let off = geometry.given[axis].abs_diff(size[axis] * times);
+            off == 0 || (fixed[axis].is_some() && off < *times)
+        })
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
