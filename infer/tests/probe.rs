@@ -7,8 +7,8 @@ use std::path::PathBuf;
 
 use barchan_datasets::{Rgb, open};
 use barchan_infer::{
-    Channels, Contract, DisparityEngine, InferError, Layout, OnnxEngine, OutputLayout, Runtime, Side,
-    Unit, Verdict, probe,
+    Channels, Contract, DisparityEngine, InferError, Layout, OnnxEngine, OutputLayout, Runtime,
+    Side, Unit, Verdict, probe,
 };
 use support::{IMAGENET, Inputs, Stereo};
 
@@ -77,11 +77,20 @@ fn hitnet_is_understood() {
         assert_eq!(contract.input[0].images, [Side::Left, Side::Right]);
         assert_eq!(contract.images.mean, vec![0.0; if grey { 1 } else { 3 }]);
         assert_eq!(contract.images.std, vec![1.0; if grey { 1 } else { 3 }]);
-        assert_eq!(contract.images.channels, if grey { Channels::Grey } else { Channels::Rgb });
+        assert_eq!(
+            contract.images.channels,
+            if grey { Channels::Grey } else { Channels::Rgb }
+        );
         assert_eq!(contract.output.name, "reference_output_disparity");
         assert_eq!(contract.output.layout, OutputLayout::Nhwc);
-        assert_eq!((contract.output.factor, contract.output.unit), (1.0, Unit::Pixels));
-        assert_eq!(contract.size.width.zip(contract.size.height), Some((192, 128)));
+        assert_eq!(
+            (contract.output.factor, contract.output.unit),
+            (1.0, Unit::Pixels)
+        );
+        assert_eq!(
+            contract.size.width.zip(contract.size.height),
+            Some((192, 128))
+        );
         assert!(decided(&verdict, "images") && decided(&verdict, "values"));
     }
 }
@@ -96,11 +105,17 @@ fn crestereo_is_understood_with_two_and_four_inputs_and_either_sign() {
         let contract = &verdict.contract;
         assert_eq!(contract.images.std, vec![1.0 / 255.0; 3]);
         assert_eq!(contract.output.factor, f64::from(factor));
-        assert_eq!((contract.output.layout, contract.output.channel), (OutputLayout::Nchw, 0));
+        assert_eq!(
+            (contract.output.layout, contract.output.channel),
+            (OutputLayout::Nchw, 0)
+        );
         let shrinks: Vec<usize> = contract.input.iter().map(|i| i.shrink).collect();
         assert_eq!(shrinks, if four { vec![2, 2, 1, 1] } else { vec![1, 1] });
         assert!(decided(&verdict, "images") && decided(&verdict, "values"));
-        assert!(!decided(&verdict, "channels"), "grey matching cannot tell RGB from BGR");
+        assert!(
+            !decided(&verdict, "channels"),
+            "grey matching cannot tell RGB from BGR"
+        );
     }
 }
 
@@ -129,7 +144,13 @@ fn layouts_values_and_orders_are_told_apart() {
         ..Stereo::default()
     });
     assert_eq!(verdict.contract.input[0].images, [Side::Right]);
-    assert_eq!((verdict.contract.images.mean[0], verdict.contract.images.std[0]), (0.5, 0.5));
+    assert_eq!(
+        (
+            verdict.contract.images.mean[0],
+            verdict.contract.images.std[0]
+        ),
+        (0.5, 0.5)
+    );
 }
 
 #[test]
@@ -140,14 +161,20 @@ fn units_and_resolutions_are_measured() {
         factor: 0.25,
         ..Stereo::default()
     });
-    assert_eq!((verdict.contract.output.factor, verdict.contract.output.unit), (4.0, Unit::Pixels));
+    assert_eq!(
+        (verdict.contract.output.factor, verdict.contract.output.unit),
+        (4.0, Unit::Pixels)
+    );
     // A share of the width, leftwards.
     let verdict = understood(&Stereo {
         share: true,
         factor: -1.0,
         ..Stereo::default()
     });
-    assert_eq!((verdict.contract.output.factor, verdict.contract.output.unit), (-1.0, Unit::Width));
+    assert_eq!(
+        (verdict.contract.output.factor, verdict.contract.output.unit),
+        (-1.0, Unit::Width)
+    );
     // No usual factor: as it was measured.
     let verdict = understood(&Stereo {
         factor: 1.0 / 100.0,
@@ -160,6 +187,7 @@ fn units_and_resolutions_are_measured() {
 fn free_sizes_are_explored() {
     let free = Stereo {
         size: None,
+        grey: true,
         disparities: 40,
         ..Stereo::default()
     };
@@ -169,7 +197,10 @@ fn free_sizes_are_explored() {
         ..free.clone()
     });
     let size = &verdict.contract.size;
-    assert_eq!((size.width, size.height, size.multiple, size.batch), (None, None, 32, false));
+    assert_eq!(
+        (size.width, size.height, size.multiple, size.batch),
+        (None, None, 32, false)
+    );
     assert_eq!(verdict.contract.output.unit, Unit::Width);
 
     // Shift by up to 39 pixels needs no more than one: any size, and several at once.
@@ -178,7 +209,10 @@ fn free_sizes_are_explored() {
         ..free
     };
     let verdict = understood(&model);
-    assert_eq!((verdict.contract.size.multiple, verdict.contract.size.batch), (1, true));
+    assert_eq!(
+        (verdict.contract.size.multiple, verdict.contract.size.batch),
+        (1, true)
+    );
     let (_dir, path) = folder(&model);
     verdict.save(&path).unwrap();
     let mut engine = OnnxEngine::load(&runtime(), &path, 0).unwrap();
@@ -187,9 +221,16 @@ fn free_sizes_are_explored() {
             image::Rgb([((x * 7 + y * 13 + seed * 5) % 31) as f32 / 31.0; 3])
         })
     };
-    let images: Vec<Rgb> = [(1, 64, 48), (2, 64, 48), (3, 64, 48), (4, 7, 5), (5, 1, 1), (6, 300, 3)]
-        .map(|(seed, w, h)| image(seed, w, h))
-        .to_vec();
+    let images: Vec<Rgb> = [
+        (1, 64, 48),
+        (2, 64, 48),
+        (3, 64, 48),
+        (4, 7, 5),
+        (5, 1, 1),
+        (6, 300, 3),
+    ]
+    .map(|(seed, w, h)| image(seed, w, h))
+    .to_vec();
     let pairs: Vec<(&Rgb, &Rgb)> = images.iter().map(|i| (i, i)).collect();
     let together = engine.disparity_batch(&pairs).unwrap();
     assert_eq!(together.len(), pairs.len());
@@ -201,7 +242,10 @@ fn free_sizes_are_explored() {
         }
     }
     engine.warm_up(33, 17).unwrap();
-    assert!(matches!(engine.warm_up(0, 5), Err(InferError::Sizes { .. })));
+    assert!(matches!(
+        engine.warm_up(0, 5),
+        Err(InferError::Sizes { .. })
+    ));
     assert!(engine.disparity_batch(&[(&images[0], &images[3])]).is_err());
 }
 
@@ -212,7 +256,9 @@ fn what_a_fixed_model_says_is_judged_by_the_pair() {
     verdict(&path).unwrap().save(&path).unwrap();
     let mut engine = OnnxEngine::load(&runtime(), &path, 1).unwrap();
     for (width, height) in [(1, 1), (7, 5), (500, 20), (192, 128)] {
-        let image = Rgb::from_fn(width, height, |x, y| image::Rgb([((x ^ y) % 7) as f32 / 7.0; 3]));
+        let image = Rgb::from_fn(width, height, |x, y| {
+            image::Rgb([((x ^ y) % 7) as f32 / 7.0; 3])
+        });
         let map = engine.disparity(&image, &image).unwrap();
         assert_eq!(map.sigma.dimensions(), (width, height));
         assert!(map.confidence.iter().all(|c| (0.0..=1.0).contains(c)));
@@ -228,9 +274,14 @@ fn what_a_fixed_model_says_is_judged_by_the_pair() {
         .map(|(c, (d, t))| (*c, (d - t).abs() > 1.0))
         .collect();
     all.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let wrong = |part: &[(f32, bool)]| part.iter().filter(|(_, w)| *w).count() as f32 / part.len() as f32;
+    let wrong =
+        |part: &[(f32, bool)]| part.iter().filter(|(_, w)| *w).count() as f32 / part.len() as f32;
     let (low, high) = all.split_at(all.len() / 2);
-    println!("wrong of the less confident half {}, of the other {}", wrong(low), wrong(high));
+    println!(
+        "wrong of the less confident half {}, of the other {}",
+        wrong(low),
+        wrong(high)
+    );
     assert!(wrong(high) < 0.5 * wrong(low));
 }
 
@@ -257,7 +308,10 @@ fn refused(model: &Stereo, words: &str) {
     let (_dir, path) = folder(model);
     let message = verdict(&path).unwrap_err().to_string();
     println!("{message}\n");
-    assert!(message.contains(words) && message.contains("cure") && message.contains("x.onnx"), "{message}");
+    assert!(
+        message.contains(words) && message.contains("cure") && message.contains("x.onnx"),
+        "{message}"
+    );
     assert!(!Contract::path_beside(&path).exists());
 }
 
@@ -276,7 +330,7 @@ fn what_is_no_stereo_is_refused() {
             blind_of_right: true,
             ..Stereo::default()
         },
-        "",
+        "no output follows the disparity",
     );
     refused(
         &Stereo {
@@ -300,10 +354,18 @@ fn what_is_no_stereo_is_refused() {
 fn damaged_files_are_refused_by_name() {
     let (dir, path) = folder(&Stereo::default());
     let runtime = runtime();
-    let load = || OnnxEngine::load(&runtime, &path, 0).err().unwrap().to_string();
+    let load = || {
+        OnnxEngine::load(&runtime, &path, 0)
+            .err()
+            .unwrap()
+            .to_string()
+    };
     // Somebody else's names, and no x.toml.
     let (_other, foreign) = folder(&Stereo::hitnet(false));
-    let message = OnnxEngine::load(&runtime, &foreign, 0).err().unwrap().to_string();
+    let message = OnnxEngine::load(&runtime, &foreign, 0)
+        .err()
+        .unwrap()
+        .to_string();
     assert!(message.contains("barchan probe"), "{message}");
 
     let good = verdict(&path).unwrap();
@@ -324,7 +386,10 @@ fn damaged_files_are_refused_by_name() {
         assert!(text.contains(from), "{from} in {text}");
         std::fs::write(&toml, text.replacen(from, to, 1)).unwrap();
         let message = load();
-        assert!(message.contains("x.toml") && message.contains(field) && message.contains("cure"), "{message}");
+        assert!(
+            message.contains("x.toml") && message.contains(field) && message.contains("cure"),
+            "{message}"
+        );
     }
     for bytes in [&b""[..], b"\xff\xfe", b"[images"] {
         std::fs::write(&toml, bytes).unwrap();
@@ -336,10 +401,19 @@ fn damaged_files_are_refused_by_name() {
     assert_eq!(Contract::load(&toml).unwrap(), good.contract);
     good.save(&path).unwrap();
     assert_eq!(std::fs::read_to_string(&toml).unwrap(), text);
-    assert_eq!(dir.path().read_dir().unwrap().count(), 2, "nothing else is left behind");
+    assert_eq!(
+        dir.path().read_dir().unwrap().count(),
+        2,
+        "nothing else is left behind"
+    );
 
     let whole = std::fs::read(&path).unwrap();
-    for bytes in [&whole[..whole.len() / 2], b"", b"no onnx at all", &whole[whole.len() / 2..]] {
+    for bytes in [
+        &whole[..whole.len() / 2],
+        b"",
+        b"no onnx at all",
+        &whole[whole.len() / 2..],
+    ] {
         std::fs::write(&path, bytes).unwrap();
         assert!(load().contains("x.onnx"));
         assert!(verdict(&path).is_err());

@@ -118,7 +118,10 @@ struct Tensor {
 impl Graph {
     fn check(&self) -> Result<(), String> {
         if !self.sparse_initializer.is_empty() {
-            return Err("holds sparse constants, which are not served\n  cure: export it with dense ones".into());
+            return Err(
+                "holds sparse constants, which are not served\n  cure: export it with dense ones"
+                    .into(),
+            );
         }
         let mut constants: HashMap<&str, &Tensor> = HashMap::new();
         for tensor in &self.initializer {
@@ -131,7 +134,10 @@ impl Graph {
                     tensor.check(&node.name)?;
                 }
                 if attribute.sparse_tensor.is_some() {
-                    return Err(format!("node \"{}\" holds a sparse constant, which is not served\n  cure: export it with dense ones", node.name));
+                    return Err(format!(
+                        "node \"{}\" holds a sparse constant, which is not served\n  cure: export it with dense ones",
+                        node.name
+                    ));
                 }
                 for graph in attribute.graph.iter().chain(&attribute.graphs) {
                     graph.check()?;
@@ -404,6 +410,9 @@ mod tests {
         let mut model = vec![0x3a, graph.len() as u8];
         model.extend(graph);
         let message = check(model.into()).unwrap_err();
-        assert!(message.contains("another file") && message.contains("cure"), "{message}");
+        assert!(
+            message.contains("another file") && message.contains("cure"),
+            "{message}"
+        );
     }
 }

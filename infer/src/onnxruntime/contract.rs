@@ -308,7 +308,9 @@ impl Contract {
         within("size.at_least", self.size.at_least, 4096)?;
         let factor = self.output.factor;
         if !factor.is_finite() || factor == 0.0 {
-            return Err(format!("output.factor is {factor}, expected a number, not 0"));
+            return Err(format!(
+                "output.factor is {factor}, expected a number, not 0"
+            ));
         }
         for input in &self.input {
             let field = |name| format!("input \"{}\": {name}", input.name);
@@ -318,7 +320,10 @@ impl Contract {
                 (self.size.width, self.size.multiple),
                 (self.size.height, self.size.multiple),
             ];
-            if sides.iter().any(|(fixed, multiple)| !fixed.unwrap_or(*multiple).is_multiple_of(input.shrink)) {
+            if sides
+                .iter()
+                .any(|(fixed, multiple)| !fixed.unwrap_or(*multiple).is_multiple_of(input.shrink))
+            {
                 return Err(format!(
                     "{} is {}, which does not divide the model's sizes",
                     field("shrink"),

@@ -55,13 +55,15 @@ impl OnnxEngine {
         let beside = Contract::path_beside(path);
         let contract = if beside.exists() {
             let contract = Contract::load(&beside)?;
-            contract.fits(&session).map_err(|message| InferError::Model {
-                path: beside,
-                message: format!(
-                    "{message}\n  cure: `barchan probe {}` writes it anew",
-                    path.display()
-                ),
-            })?;
+            contract
+                .fits(&session)
+                .map_err(|message| InferError::Model {
+                    path: beside,
+                    message: format!(
+                        "{message}\n  cure: `barchan probe {}` writes it anew",
+                        path.display()
+                    ),
+                })?;
             contract
         } else if is_own(&session) {
             Contract::own()
@@ -242,10 +244,18 @@ impl Contract {
                 }
             }
         }
-        if let Some(input) = self.input.iter().find(|i| inputs.iter().all(|(name, _)| *name != i.name)) {
+        if let Some(input) = self
+            .input
+            .iter()
+            .find(|i| inputs.iter().all(|(name, _)| *name != i.name))
+        {
             return Err(format!("input \"{}\" is not in the model", input.name));
         }
-        let named = [Some(&self.output.name), self.output.sigma.as_ref(), self.output.confidence.as_ref()];
+        let named = [
+            Some(&self.output.name),
+            self.output.sigma.as_ref(),
+            self.output.confidence.as_ref(),
+        ];
         for name in named.into_iter().flatten() {
             if session.outputs().iter().all(|o| o.name() != name) {
                 return Err(format!("output \"{name}\" is not in the model"));

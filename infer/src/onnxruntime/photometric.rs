@@ -29,12 +29,15 @@ pub(crate) fn judge(left: &Rgb, right: &Rgb, disparity: Plane) -> DisparityMap {
         .map(|(sigma, dissimilarity)| {
             // (1 - SSIM) / 2 is NaN where there is nothing to compare.
             let similar = (1.0 - 2.0 * dissimilarity).max(0.0);
-            if similar.is_nan() { 0.0 } else { similar * within(1.0 / sigma) }
+            if similar.is_nan() {
+                0.0
+            } else {
+                similar * within(1.0 / sigma)
+            }
         })
         .collect();
     // One value a pixel by construction.
-    let confidence =
-        Plane::from_raw(left.width(), left.height(), confidence).unwrap_or_default();
+    let confidence = Plane::from_raw(left.width(), left.height(), confidence).unwrap_or_default();
     DisparityMap {
         disparity,
         sigma,
@@ -103,7 +106,13 @@ mod tests {
 
     #[test]
     fn the_normal_distribution_is_met() {
-        for (z, p) in [(0.0, 0.0), (0.5, 0.38292), (1.0, 0.68269), (2.0, 0.9545), (4.0, 0.99994)] {
+        for (z, p) in [
+            (0.0, 0.0),
+            (0.5, 0.38292),
+            (1.0, 0.68269),
+            (2.0, 0.9545),
+            (4.0, 0.99994),
+        ] {
             assert!((within(z) - p).abs() < 6e-4, "{z}: {}", within(z));
         }
     }
@@ -119,7 +128,13 @@ mod tests {
             })
         };
         let disparity = Plane::from_fn(96, 64, |x, _| {
-            image::Luma([if x < 50 { 4.0 } else if x < 90 { 5.5 } else { f32::NAN }])
+            image::Luma([if x < 50 {
+                4.0
+            } else if x < 90 {
+                5.5
+            } else {
+                f32::NAN
+            }])
         });
         let map = judge(&image(0), &image(4), disparity);
         let mean = |plane: &Plane, xs: std::ops::Range<u32>, ys: std::ops::Range<u32>| {
@@ -128,7 +143,12 @@ mod tests {
                 .collect();
             values.iter().sum::<f32>() / values.len() as f32
         };
-        let (good, wrong, flat, unknown) = ((8..44, 4..28), (54..86, 4..28), (8..44, 40..60), (91..96, 4..60));
+        let (good, wrong, flat, unknown) = (
+            (8..44, 4..28),
+            (54..86, 4..28),
+            (8..44, 40..60),
+            (91..96, 4..60),
+        );
         let of = |plane: &Plane, at: &(std::ops::Range<u32>, std::ops::Range<u32>)| {
             mean(plane, at.0.clone(), at.1.clone())
         };
@@ -137,6 +157,9 @@ mod tests {
         assert!(of(&map.confidence, &wrong) < 0.3 * of(&map.confidence, &good));
         assert_eq!(of(&map.sigma, &flat), MOST_SIGMA);
         assert!(of(&map.confidence, &flat) < 0.2);
-        assert_eq!((of(&map.sigma, &unknown), of(&map.confidence, &unknown)), (8.0, 0.0));
+        assert_eq!(
+            (of(&map.sigma, &unknown), of(&map.confidence, &unknown)),
+            (8.0, 0.0)
+        );
     }
 }

@@ -67,7 +67,11 @@ impl Geometry {
                 .map(|i| {
                     let at = ((i as f64 + 0.5) * scale - 0.5).clamp(0.0, (length - 1) as f64);
                     let first = at as usize;
-                    (first, (first + 1).min(length - 1), (at - first as f64) as f32)
+                    (
+                        first,
+                        (first + 1).min(length - 1),
+                        (at - first as f64) as f32,
+                    )
                 })
                 .collect()
         };
@@ -78,7 +82,10 @@ impl Geometry {
         for (y0, y1, ty) in down {
             let (upper, lower) = (&plane[y0 * columns..], &plane[y1 * columns..]);
             out.extend(across.iter().map(|(x0, x1, tx)| {
-                let (a, b) = (mix(upper[*x0], upper[*x1], *tx), mix(lower[*x0], lower[*x1], *tx));
+                let (a, b) = (
+                    mix(upper[*x0], upper[*x1], *tx),
+                    mix(lower[*x0], lower[*x1], *tx),
+                );
                 known(mix(a, b, ty))
             }));
         }
@@ -151,7 +158,12 @@ fn shrunk<'a>(image: &'a Rgb, [width, height]: [usize; 2]) -> Cow<'a, Rgb> {
     if image.dimensions() == size {
         return Cow::Borrowed(image);
     }
-    Cow::Owned(imageops::resize(image, size.0, size.1, FilterType::Triangle))
+    Cow::Owned(imageops::resize(
+        image,
+        size.0,
+        size.1,
+        FilterType::Triangle,
+    ))
 }
 
 /// Appends images, stacked along their channels, in the layout and values that are wanted.

@@ -56,7 +56,10 @@ pub(super) fn hypotheses(inputs: &[(String, [i64; 4])]) -> Result<Vec<Hypothesis
     for (layout, axis, rows, columns) in [(Layout::Nchw, 1, 2, 3), (Layout::Nhwc, 3, 1, 2)] {
         for count in [3, 1] {
             let free_or = |dim: i64, wanted: usize| dim == -1 || dim == wanted as i64;
-            if !inputs.iter().all(|(_, d)| free_or(d[axis], count * stacked)) {
+            if !inputs
+                .iter()
+                .all(|(_, d)| free_or(d[axis], count * stacked))
+            {
                 continue;
             }
             let sizes: Vec<[i64; 2]> = inputs.iter().map(|(_, d)| [d[columns], d[rows]]).collect();
@@ -149,12 +152,20 @@ fn shrinks(inputs: &[(String, [i64; 4])], sizes: &[[i64; 2]]) -> Vec<Vec<usize>>
     }
     let largest = sizes.iter().map(|s| s[0]).max().unwrap_or(0);
     let by_size: Vec<usize> = (sizes.iter())
-        .map(|s| if s[0] > 0 && 2 * s[0] == largest { 2 } else { 1 })
+        .map(|s| {
+            if s[0] > 0 && 2 * s[0] == largest {
+                2
+            } else {
+                1
+            }
+        })
         .collect();
     let by_name: Vec<usize> = (inputs.iter())
         .map(|(name, _)| {
             let name = name.to_lowercase();
-            let small = ["init", "half", "low", "small"].iter().any(|w| name.contains(w));
+            let small = ["init", "half", "low", "small"]
+                .iter()
+                .any(|w| name.contains(w));
             if small { 2 } else { 1 }
         })
         .collect();
@@ -244,15 +255,26 @@ mod tests {
         assert_eq!(count(&[("input", [1, 6, 240, 320])]), Ok(16));
         assert_eq!(count(&[("input", [1, 2, 240, 320])]), Ok(8));
         assert_eq!(count(&[("input", [1, 240, 320, 6])]), Ok(16));
-        assert_eq!(count(&[("a", [1, 3, -1, -1]), ("b", [1, 3, -1, -1])]), Ok(16));
+        assert_eq!(
+            count(&[("a", [1, 3, -1, -1]), ("b", [1, 3, -1, -1])]),
+            Ok(16)
+        );
         // Nothing is known: both layouts, colour and grey.
         assert_eq!(count(&[("a", [-1; 4]), ("b", [-1; 4])]), Ok(48));
         let half = [1, 3, 120, 160];
         let full = [1, 3, 240, 320];
-        let four = [("init_left", half), ("init_right", half), ("next_left", full), ("next_right", full)];
+        let four = [
+            ("init_left", half),
+            ("init_right", half),
+            ("next_left", full),
+            ("next_right", full),
+        ];
         assert_eq!(count(&four), Ok(16));
         assert_eq!(count(&four.map(|(name, _)| (name, [1, 3, -1, -1]))), Ok(16));
-        assert_eq!(count(&["a", "b", "c", "d"].map(|n| (n, [1, 3, -1, -1]))), Ok(32));
+        assert_eq!(
+            count(&["a", "b", "c", "d"].map(|n| (n, [1, 3, -1, -1]))),
+            Ok(32)
+        );
     }
 
     #[test]

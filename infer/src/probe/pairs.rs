@@ -14,15 +14,16 @@ pub(super) struct KnownPair {
 /// trained for.
 const JUDGED: f32 = 0.125;
 
-/// Two random scenes of many colours and one of sand and rocks: what holds for all three is no luck.
+/// Random scenes of many colours, materials and disparities, of those that semi-global matching masters:
+/// what holds for all of them is no luck, and nothing but their images tells their disparity.
 ///
 /// # Errors
 /// When the size is out of the renderer's range.
 pub(super) fn render([width, height]: [usize; 2]) -> Result<Vec<KnownPair>, DataError> {
     let mut pairs = Vec::new();
-    for (kind, frames) in [("scenes,seed=5", 2), ("seed=3", 1)] {
+    for (seed, frames) in [(8, 2), (7, 2)] {
         let source = open(&format!(
-            "synth:{kind},frames={frames},width={width},height={height}"
+            "synth:scenes,seed={seed},frames={frames},width={width},height={height}"
         ))?;
         for index in 0..frames {
             let frame = source.frame(index)?;
@@ -103,7 +104,11 @@ pub(super) fn error(compared: impl Iterator<Item = (f32, f32)>, width: usize) ->
     let (mut sum, mut count) = (0.0, 0usize);
     for (truth, answer) in compared {
         let error = f64::from((answer - truth).abs());
-        sum += if error.is_nan() { most } else { error.min(most) };
+        sum += if error.is_nan() {
+            most
+        } else {
+            error.min(most)
+        };
         count += 1;
     }
     if count == 0 { most } else { sum / count as f64 }
@@ -184,7 +189,7 @@ mod tests {
     #[test]
     fn known_pairs_are_known() {
         let pairs = render([128, 96]).unwrap();
-        assert_eq!(pairs.len(), 3);
+        assert_eq!(pairs.len(), 4);
         for pair in &pairs {
             let perfect = error(pair.compare(&pair.truth), 128);
             assert_eq!(perfect, 0.0);

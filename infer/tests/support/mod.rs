@@ -119,7 +119,11 @@ impl Stereo {
         let stack = if self.inputs == Inputs::Stacked { 2 } else { 1 };
         let channels = stack * if self.grey { 1 } else { 3 };
         for (k, name) in self.names.iter().enumerate() {
-            let shrink = if self.inputs == Inputs::Four && k < 2 { 2 } else { 1 };
+            let shrink = if self.inputs == Inputs::Four && k < 2 {
+                2
+            } else {
+                1
+            };
             let side = |axis: usize, free: &str| match self.size {
                 Some(size) => (size[axis] / shrink).to_string(),
                 None => free.to_owned(),
@@ -137,13 +141,20 @@ impl Stereo {
         for name in &self.names {
             let mut x = (*name).to_owned();
             if self.nhwc {
-                x = g.plain("Transpose", &[&x], vec![Attribute::ints("perm", &[0, 3, 1, 2])]);
+                x = g.plain(
+                    "Transpose",
+                    &[&x],
+                    vec![Attribute::ints("perm", &[0, 3, 1, 2])],
+                );
             }
             let each = channels / stack;
             for k in 0..stack {
                 let mut part = x.clone();
                 if stack == 2 {
-                    let (from, to) = (g.ints(&[(k * each) as i64]), g.ints(&[((k + 1) * each) as i64]));
+                    let (from, to) = (
+                        g.ints(&[(k * each) as i64]),
+                        g.ints(&[((k + 1) * each) as i64]),
+                    );
                     let axis = g.ints(&[1]);
                     part = g.plain("Slice", &[&x, &from, &to, &axis], vec![]);
                 }
@@ -174,12 +185,11 @@ impl Stereo {
                 &[&half, "", &scales],
                 vec![Attribute::string("mode", "linear")],
             );
-            // Twice the disparity, and half the weight.
-            let sum = g.plain("Add", &[&disparity, &up], vec![]);
-            let one = g.scalar(0.5);
-            let fine = g.plain("Mul", &[&disparity, &one], vec![]);
-            let _ = sum;
-            disparity = g.plain("Add", &[&fine, &up], vec![]);
+            // Three quarters of the full disparity, a quarter of twice the half one.
+            let (a, b) = (g.scalar(0.75), g.scalar(0.5));
+            let fine = g.plain("Mul", &[&disparity, &a], vec![]);
+            let coarse = g.plain("Mul", &[&up, &b], vec![]);
+            disparity = g.plain("Add", &[&fine, &coarse], vec![]);
         }
         if self.multiple > 1 {
             let block = || vec![Attribute::int("blocksize", self.multiple as i64)];
@@ -191,7 +201,10 @@ impl Stereo {
             disparity = g.plain(
                 "AveragePool",
                 &[&disparity],
-                vec![Attribute::ints("kernel_shape", &k), Attribute::ints("strides", &k)],
+                vec![
+                    Attribute::ints("kernel_shape", &k),
+                    Attribute::ints("strides", &k),
+                ],
             );
         }
         if self.share {
@@ -239,11 +252,21 @@ impl Stereo {
         let value = g.plain("Add", &[&scaled, &mean], vec![]);
         let (low, high) = (g.scalar(0.0), g.scalar(1.0));
         let value = g.plain("Clip", &[&value, &low, &high], vec![]);
-        if self.grey {
-            return value;
+        let mut grey = value;
+        if !self.grey {
+            let weights = g.floats("weights", &[1, 3, 1, 1], [0.299, 0.587, 0.114]);
+            grey = g.plain("Conv", &[&grey, &weights], vec![]);
         }
-        let weights = g.floats("weights", &[1, 3, 1, 1], [0.299, 0.587, 0.114]);
-        g.plain("Conv", &[&value, &weights], vec![])
+        // The cameras differ in gain: what matters is how a pixel stands out.
+        let around = g.plain(
+            "AveragePool",
+            &[&grey],
+            vec![
+                Attribute::ints("kernel_shape", &[9; 2]),
+                Attribute::ints("pads", &[4; 4]),
+            ],
+        );
+        g.plain("Sub", &[&grey, &around], vec![])
     }
 
     fn matched(&self, g: &mut GraphBuilder, left: &str, right: &str, range: usize) -> String {
@@ -253,7 +276,11 @@ impl Stereo {
             let mut shifted = right.to_owned();
             if d > 0 {
                 let pads = g.ints(&[0, 0, 0, d as i64, 0, 0, 0, 0]);
-                let padded = g.plain("Pad", &[right, &pads], vec![Attribute::string("mode", "edge")]);
+                let padded = g.plain(
+                    "Pad",
+                    &[right, &pads],
+                    vec![Attribute::string("mode", "edge")],
+                );
                 let (from, to, axis) = (g.ints(&[0]), g.ints(&[-(d as i64)]), g.ints(&[3]));
                 shifted = g.plain("Slice", &[&padded, &from, &to, &axis], vec![]);
             }
@@ -267,13 +294,20 @@ impl Stereo {
             volume = g.plain(
                 "AveragePool",
                 &[&volume],
-                vec![Attribute::ints("kernel_shape", &kernel), Attribute::ints("pads", &pads)],
+                vec![
+                    Attribute::ints("kernel_shape", &kernel),
+                    Attribute::ints("pads", &pads),
+                ],
             );
         }
-        let sharp = g.scalar(-400.0);
+        let sharp = g.scalar(-1500.0);
         let score = g.plain("Mul", &[&volume, &sharp], vec![]);
         let share = g.plain("Softmax", &[&score], vec![Attribute::int("axis", 1)]);
-        let values = g.floats("disparities", &[1, range, 1, 1], (0..range).map(|d| d as f32));
+        let values = g.floats(
+            "disparities",
+            &[1, range, 1, 1],
+            (0..range).map(|d| d as f32),
+        );
         g.plain("Conv", &[&share, &values], vec![])
     }
 }
