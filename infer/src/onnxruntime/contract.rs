@@ -342,4 +342,4 @@ impl Contract {
 /// Longest side of a fixed size that is served.
 pub(crate) const MOST_SIDE: usize = 16384;
 /// Most pixels of a fixed size that is served.
-pub(crate) const MOST_AREA: usize = 1 << 26;
+pub(crate) const MOST_AREA: usize = 1 << 24;

@@ -49,11 +49,9 @@ pub struct Decision {
     pub question: &'static str,
     /// What was found.
     pub answer: String,
-    /// With which error, pixels.
-    pub error: f64,
     /// The next best answer.
     pub alternative: Option<String>,
-    /// Its error on the same pairs; absent where the model does not run with it.
+    /// Its error, pixels; absent where the model does not run with it.
     pub alternative_error: Option<f64>,
     /// Whether the two differ; if not, the usual one is taken.
     pub decided: bool,
@@ -98,20 +96,36 @@ pub fn probe(
     };
     let mut session = open(runtime, path, threads)?;
     let inputs = image_inputs(&session).map_err(wrong)?;
-    let ways = hypotheses(&inputs).map_err(wrong)?;
+    let mut ways = hypotheses(&inputs).map_err(wrong)?;
+    let own = is_own(&session);
+    if own {
+        // What we export is known; it is held to it.
+        let known = Contract::own();
+        ways.retain(|way| {
+            (&way.contract.images, &way.contract.input) == (&known.images, &known.input)
+        });
+    }
 
     // Every way of feeding it on one pair, at the first size with which it runs at all.
     let (pairs, size, mut trials) = first_trials(&mut session, &ways, progress).map_err(wrong)?;
     let ran = trials.len();
 
-    // The best of them on all pairs; of those that err alike the most usual.
+    // The best of them on all pairs, and to each question the best other answer.
     trials.sort_by(|a, b| a.first.error.total_cmp(&b.first.error));
-    for trial in trials.iter_mut().take(CONTENDERS) {
-        let way = &ways[trial.way].contract;
-        trial.all = readings(&mut session, way, &pairs)
+    let mut contenders: Vec<usize> = (0..trials.len().min(CONTENDERS)).collect();
+    for question in 0..QUESTIONS.len() {
+        let answer = |trial: &Trial| &ways[trial.way].answers[question];
+        let other = (trials.iter()).position(|trial| answer(trial) != answer(&trials[0]));
+        contenders.extend(other.filter(|other| !contenders.contains(other)));
+    }
+    for contender in contenders {
+        let trial = &mut trials[contender];
+        trial.all = readings(&mut session, &ways[trial.way].contract, &pairs)
             .ok()
             .and_then(|readings| best(readings, &pairs, size));
     }
+
+    // Of those that err alike the most usual.
     let tolerance = Tolerance::of(&pairs);
     let least = trials
         .iter()
@@ -130,7 +144,7 @@ pub fn probe(
         )));
     };
     let blind = blind_error(&pairs);
-    let decisions = decide(&ways, &trials, winner, &tolerance);
+    let decisions = decide(&ways, &trials, winner, score, &tolerance);
     let mut contract = ways[winner.way].contract.clone();
     contract.output = score.output.clone();
     let found = Found {
@@ -142,7 +156,6 @@ pub fn probe(
     found.must_explain().map_err(wrong)?;
 
     // The answer must follow the right image: what sees one image alone can be right by habit.
-    let own = is_own(&session);
     if own {
         contract.output.sigma = Some("sigma".into());
         contract.output.confidence = Some("confidence".into());
@@ -379,8 +392,8 @@ fn usual_factor(measured: f64, width: usize) -> (f64, Unit) {
     if near(width as f64) {
         return (measured.signum(), Unit::Width);
     }
-    let digit = 10f64.powf(measured.abs().log10().floor() - 2.0);
-    ((measured / digit).round() * digit, Unit::Pixels)
+    let rounded = format!("{measured:.2e}").parse().unwrap_or(measured);
+    (rounded, Unit::Pixels)
 }
 
 /// When two errors are the same for all that is known: within 5 % and a ten-thousandth of the width.
@@ -405,33 +418,24 @@ fn decide(
     ways: &[Hypothesis],
     trials: &[Trial],
     winner: &Trial,
+    score: &Score,
     tolerance: &Tolerance,
 ) -> Vec<Decision> {
     let mut decisions = Vec::new();
     for (k, question) in QUESTIONS.iter().enumerate() {
         let answer = &ways[winner.way].answers[k];
-        let other = |way: &Hypothesis| way.answers[k] != *answer;
-        // Errors on all pairs where both were tried on all, else on the first.
-        let errors = |trial: &Trial| match (&trial.all, &winner.all) {
-            (Some(theirs), Some(ours)) => (theirs.error, ours.error),
-            _ => (trial.first.error, winner.first.error),
-        };
         let next = (trials.iter())
-            .filter(|trial| other(&ways[trial.way]))
-            .map(|trial| (errors(trial), trial.way))
-            .min_by(|a, b| (a.0.0 - a.0.1).total_cmp(&(b.0.0 - b.0.1)));
-        let never_ran = ways.iter().find(|way| other(way));
-        let own = winner.all.as_ref().unwrap_or(&winner.first).error;
+            .filter(|trial| ways[trial.way].answers[k] != *answer)
+            .filter_map(|trial| Some((trial.all.as_ref()?.error, trial.way)))
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        let never_ran = ways.iter().position(|way| way.answers[k] != *answer);
         decisions.push(Decision {
             question,
             answer: answer.clone(),
-            error: next.map_or(own, |((_, ours), _)| ours),
-            alternative: match next {
-                Some((_, way)) => Some(ways[way].answers[k].clone()),
-                None => never_ran.map(|way| way.answers[k].clone()),
-            },
-            alternative_error: next.map(|((theirs, _), _)| theirs),
-            decided: next.is_none_or(|((theirs, ours), _)| tolerance.differ(ours, theirs)),
+            alternative: (next.map(|(_, way)| way).or(never_ran))
+                .map(|way| ways[way].answers[k].clone()),
+            alternative_error: next.map(|(error, _)| error),
+            decided: next.is_none_or(|(error, _)| tolerance.differ(score.error, error)),
         });
     }
     decisions
@@ -586,22 +590,23 @@ fn explain(verdict: &Verdict, pairs: usize, own: bool) -> Vec<String> {
         "{} ways of feeding it were tried on {pairs} rendered pairs of known disparity, {} x {} to the model; it ran with {}.",
         verdict.tried[0], size[0], size[1], verdict.tried[1]
     )];
+    lines.push(format!(
+        "It errs by {:.2} px, an answer without images by {:.2} px; correlation with the truth {:.3}; a right image moved by 1 px moves the answer by {:.2} px.",
+        verdict.error, verdict.blind_error, verdict.correlation, verdict.response
+    ));
     if own {
         lines.push("It is an export of barchan: confidence and sigma are its own.".into());
     }
     for d in &verdict.decisions {
         let beside = match (&d.alternative, d.alternative_error) {
             (Some(other), Some(error)) if d.decided => {
-                format!(
-                    "errs by {:.2} px; next best, {other}: {error:.2} px",
-                    d.error
-                )
+                format!("{error:.2} px with the next best, {other}")
             }
-            (Some(other), Some(error)) => format!(
-                "errs by {:.2} px, and so does {other} ({error:.2} px): makes no difference, the usual is taken",
-                d.error
-            ),
+            (Some(other), Some(error)) => {
+                format!("{other} makes no difference ({error:.2} px): the usual is taken")
+            }
             (Some(other), None) => format!("the model does not run with {other}"),
+            (None, _) if own => "as every export of barchan".into(),
             (None, _) => "the shapes of the inputs say so".into(),
         };
         lines.push(format!("{}: {}; {beside}", d.question, d.answer));
@@ -636,10 +641,6 @@ fn explain(verdict: &Verdict, pairs: usize, own: bool) -> Vec<String> {
         },
         o.factor,
         verdict.measured_factor
-    ));
-    lines.push(format!(
-        "error: {:.2} px (an answer without images: {:.2} px); correlation with the truth {:.3}; a right image moved by 1 px moves the answer by {:.2} px",
-        verdict.error, verdict.blind_error, verdict.correlation, verdict.response
     ));
     lines
 }

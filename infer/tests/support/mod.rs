@@ -185,8 +185,8 @@ impl Stereo {
                 &[&half, "", &scales],
                 vec![Attribute::string("mode", "linear")],
             );
-            // Three quarters of the full disparity, a quarter of twice the half one.
-            let (a, b) = (g.scalar(0.75), g.scalar(0.5));
+            // Nine tenths of the full disparity, a tenth of twice the half one.
+            let (a, b) = (g.scalar(0.9), g.scalar(0.2));
             let fine = g.plain("Mul", &[&disparity, &a], vec![]);
             let coarse = g.plain("Mul", &[&up, &b], vec![]);
             disparity = g.plain("Add", &[&fine, &coarse], vec![]);
@@ -254,7 +254,7 @@ impl Stereo {
         let value = g.plain("Clip", &[&value, &low, &high], vec![]);
         let mut grey = value;
         if !self.grey {
-            let weights = g.floats("weights", &[1, 3, 1, 1], [0.299, 0.587, 0.114]);
+            let weights = g.floats("weights", &[1, 3, 1, 1], [1.0 / 3.0; 3]);
             grey = g.plain("Conv", &[&grey, &weights], vec![]);
         }
         // The cameras differ in gain: what matters is how a pixel stands out.
