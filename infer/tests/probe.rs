@@ -59,9 +59,10 @@ fn understood(model: &Stereo) -> Verdict {
     assert_eq!(*engine.contract(), verdict.contract);
     let wide = model.size.map_or(256, |s| s[0]) as u32;
     let error = median_error(&mut engine, wide, 160);
-    assert!(error < 0.6, "median error {error} px");
+    assert!(error < 0.8, "median error {error} px");
     let error = median_error(&mut engine, 234, 131);
-    assert!(error < 1.0, "median error {error} px at another size");
+    // Its pixels are larger by a fifth, and the images that it sees are blurred by resizing.
+    assert!(error < 1.3, "median error {error} px at another size");
     verdict
 }
 

@@ -21,8 +21,9 @@ const JUDGED: f32 = 0.125;
 /// When the size is out of the renderer's range.
 pub(super) fn render([width, height]: [usize; 2]) -> Result<Vec<KnownPair>, DataError> {
     let mut pairs = Vec::new();
-    // The first has the most of different disparities: what is tried on it alone is told apart.
-    for (seed, index) in [(7, 1), (8, 1), (7, 0), (8, 0)] {
+    // The first has the most of different disparities: what is tried on it alone must not mistake a
+    // constant for an answer.
+    for (seed, index) in [(47, 0), (7, 1), (8, 1), (7, 0)] {
         let source = open(&format!(
             "synth:scenes,seed={seed},frames=2,width={width},height={height}"
         ))?;
