@@ -107,7 +107,11 @@ pub fn probe(
     }
 
     // Every way of feeding it on one pair, at the first size with which it runs at all.
-    let (pairs, size, mut trials) = first_trials(&mut session, &ways, progress).map_err(wrong)?;
+    let FirstTrials {
+        pairs,
+        size,
+        mut trials,
+    } = first_trials(&mut session, &ways, progress).map_err(wrong)?;
     let ran = trials.len();
 
     // The best of them on all pairs, and to each question the best other answer.
@@ -200,6 +204,14 @@ struct Trial {
     all: Option<Score>,
 }
 
+/// What a model was first tried on.
+struct FirstTrials {
+    pairs: Vec<KnownPair>,
+    /// What it was given.
+    size: [usize; 2],
+    trials: Vec<Trial>,
+}
+
 /// How an output does as disparity.
 #[derive(Clone)]
 struct Score {
@@ -226,7 +238,7 @@ fn first_trials(
     session: &mut Session,
     ways: &[Hypothesis],
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<(Vec<KnownPair>, [usize; 2], Vec<Trial>), String> {
+) -> Result<FirstTrials, String> {
     let fixed = ways.first().map_or([None; 2], |w| {
         [w.contract.size.width, w.contract.size.height]
     });
@@ -257,7 +269,11 @@ fn first_trials(
             progress(index + 1, ways.len());
         }
         if !trials.is_empty() {
-            return Ok((pairs, *size, trials));
+            return Ok(FirstTrials {
+                pairs,
+                size: *size,
+                trials,
+            });
         }
         if answered {
             return Err(format!(
