@@ -2,8 +2,9 @@
 //!
 //! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
 //! line see disparity, whoever makes it; [`SemiGlobal`] and [`BlockMatching`], which need no model;
-//! [`Rejection`], which marks as unknown what the pair itself
-//! contradicts. Engines stand behind features: `burn`, `onnxruntime`.
+//! [`Rejection`], which marks as unknown what the pair itself contradicts. Engines stand behind
+//! features: `burn`, `onnxruntime`. With the latter, `probe` finds out what somebody else's ONNX file
+//! wants and means, and a `Contract` (`x.toml` beside `x.onnx`) keeps it for `OnnxEngine`.
 //!
 //! What it promises: any image size; disparity positive (`x_right = x_left - d`), NaN is unknown.
 //!
