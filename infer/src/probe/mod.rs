@@ -2,72 +2,23 @@
 
 mod hypotheses;
 mod pairs;
+mod settle;
+mod verdict;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use ort::session::Session;
-use serde::Serialize;
 
+use crate::InferError;
 use crate::onnxruntime::run::{Geometry, plane, resolution, run};
 use crate::onnxruntime::{
     Contract, OnnxEngine, OutputFormat, OutputLayout, Runtime, Unit, image_inputs, is_own, open,
 };
-use crate::{DisparityEngine, InferError};
 use hypotheses::{Hypothesis, QUESTIONS, hypotheses};
-use pairs::{KnownPair, blind_error, correlation, error, fit, median, render};
-
-/// What [`probe`] found.
-#[derive(Clone, Debug, Serialize)]
-pub struct Verdict {
-    /// How the model wants its images and what its output means.
-    pub contract: Contract,
-    /// Width and height that the model was given.
-    pub size: [usize; 2],
-    /// Ways of feeding it that were tried, and how many of them it ran with.
-    pub tried: [usize; 2],
-    /// Mean absolute error over the pairs, pixels of their images; each pixel's is cut at a fortieth of
-    /// the width.
-    pub error: f64,
-    /// The same error of an answer that sees no image.
-    pub blind_error: f64,
-    /// Correlation of the output with the true disparity, along the sign that was found.
-    pub correlation: f64,
-    /// By how much the answer moves, in pixels, for each pixel that the right image is moved.
-    pub response: f64,
-    /// The factor that was measured, before it was taken for a usual one.
-    pub measured_factor: f64,
-    /// What was decided, and what else could have been.
-    pub decisions: Vec<Decision>,
-    /// All of this in plain words.
-    pub explanation: Vec<String>,
-}
-
-/// One question about the inputs.
-#[derive(Clone, Debug, Serialize)]
-pub struct Decision {
-    /// What is asked.
-    pub question: &'static str,
-    /// What was found.
-    pub answer: String,
-    /// The next best answer.
-    pub alternative: Option<String>,
-    /// Its error, pixels; absent where the model does not run with it.
-    pub alternative_error: Option<f64>,
-    /// Whether the two differ; if not, the usual one is taken.
-    pub decided: bool,
-}
-
-impl Verdict {
-    /// Writes `x.toml` beside `x.onnx`, whole or not at all, and says where.
-    ///
-    /// # Errors
-    /// When it cannot be written, or something else has that name.
-    pub fn save(&self, onnx: &Path) -> Result<PathBuf, InferError> {
-        let path = Contract::path_beside(onnx);
-        self.contract.save(&path, &self.explanation)?;
-        Ok(path)
-    }
-}
+use pairs::{KnownPair, blind_error, correlation, error, fit, render};
+use settle::{response, runs_in_batches, settle_size, settle_unit};
+use verdict::explain;
+pub use verdict::{Decision, Verdict};
 
 /// Sizes that are tried with a model that takes any, until it runs with one: multiples of 64, and what
 /// models are often exported at.
@@ -489,174 +440,4 @@ impl Found<'_> {
             score.error,
         ))
     }
-}
-
-/// By how much the answer moves for each pixel that the right image is moved.
-fn response(engine: &mut OnnxEngine, pairs: &[KnownPair]) -> Result<f64, InferError> {
-    let mut moves = Vec::new();
-    for pair in pairs {
-        let by = (pair.size()[0] / 40).max(2);
-        let moved = pair.moved(by);
-        let before = engine.disparity(&pair.left, &pair.right)?.disparity;
-        let after = engine.disparity(&moved.left, &moved.right)?.disparity;
-        moves.extend(
-            (before.iter().zip(after.iter()).zip(&moved.truth))
-                .filter(|(_, truth)| truth.is_finite())
-                .map(|((before, after), _)| (after - before) / by as f32),
-        );
-    }
-    Ok(f64::from(median(&mut moves)))
-}
-
-/// The error through the engine as a user runs it; infinite where it fails.
-fn served_error(engine: &mut OnnxEngine, pair: &KnownPair) -> f64 {
-    match engine.disparity(&pair.left, &pair.right) {
-        Ok(map) => error(pair.compare(map.disparity.as_raw()), pair.size()[0]),
-        Err(_) => f64::INFINITY,
-    }
-}
-
-/// Finds the multiples to which free sides must be padded, and the smallest size; a model that is free
-/// by declaration only is fixed to the size with which it ran.
-fn settle_size(engine: &mut OnnxEngine, pairs: &[KnownPair], given: [usize; 2], known: f64) {
-    let declared = engine.contract.size.clone();
-    let Some(pair) = pairs.first() else { return };
-    if declared.width.is_some() && declared.height.is_some() {
-        return;
-    }
-    let shrink = engine
-        .contract
-        .input
-        .iter()
-        .map(|i| i.shrink)
-        .max()
-        .unwrap_or(1);
-    let size = pair.size();
-    let good = |error: f64| error <= 1.5 * known + size[0] as f64 / 800.0;
-    for multiple in (0..8)
-        .map(|k| 1usize << k)
-        .filter(|m| m.is_multiple_of(shrink))
-    {
-        // Odd multiples, so that no larger power of two divides them.
-        let odd = size.map(|side| {
-            let times = (side * 15 / 16) / multiple;
-            multiple * (times - usize::from(times.is_multiple_of(2) && times > 0))
-        });
-        if odd.contains(&0) {
-            break;
-        }
-        engine.contract.size.multiple = multiple;
-        engine.contract.size.at_least = multiple;
-        if !good(served_error(engine, &pair.crop(odd))) {
-            continue;
-        }
-        let smallest = std::iter::successors(Some(multiple), |side| Some(2 * side))
-            .take_while(|side| *side <= size[0].min(size[1]))
-            .find(|side| served_error(engine, &pair.crop([*side; 2])).is_finite());
-        engine.contract.size.at_least = smallest.unwrap_or(size[0].min(size[1]));
-        return;
-    }
-    engine.contract.size.multiple = 1;
-    engine.contract.size.at_least = 1;
-    engine.contract.size.width = Some(given[0]);
-    engine.contract.size.height = Some(given[1]);
-}
-
-/// With a free width, tells widths from pixels by another width.
-fn settle_unit(engine: &mut OnnxEngine, pairs: &[KnownPair], given: [usize; 2]) {
-    let output = engine.contract.output.clone();
-    if output.unit == Unit::Pixels || engine.contract.size.width.is_some() {
-        return;
-    }
-    let narrow: Vec<KnownPair> = (pairs.iter())
-        .map(|pair| pair.crop([pair.size()[0] * 3 / 5, pair.size()[1]]))
-        .collect();
-    let as_width: f64 = narrow.iter().map(|p| served_error(engine, p)).sum();
-    engine.contract.output.unit = Unit::Pixels;
-    engine.contract.output.factor = output.factor * given[0] as f64;
-    let as_pixels: f64 = narrow.iter().map(|p| served_error(engine, p)).sum();
-    if as_width <= as_pixels {
-        engine.contract.output = output;
-    }
-}
-
-/// Whether two pairs at once give what they give one by one.
-fn runs_in_batches(engine: &mut OnnxEngine, pairs: &[KnownPair]) -> bool {
-    let pairs: Vec<_> = pairs.iter().take(2).map(|p| (&p.left, &p.right)).collect();
-    let alone = engine.disparity_batch(&pairs);
-    engine.contract.size.batch = true;
-    let together = engine.disparity_batch(&pairs);
-    engine.contract.size.batch = false;
-    let (Ok(alone), Ok(together)) = (alone, together) else {
-        return false;
-    };
-    alone.iter().zip(&together).all(|(a, b)| {
-        let mut apart: Vec<f32> = (a.disparity.iter().zip(b.disparity.iter()))
-            .map(|(a, b)| (a - b).abs())
-            .filter(|d| d.is_finite())
-            .collect();
-        median(&mut apart) < 1e-2
-    })
-}
-
-/// The verdict in plain words.
-fn explain(verdict: &Verdict, pairs: usize, own: bool) -> Vec<String> {
-    let Verdict { contract, size, .. } = verdict;
-    let mut lines = vec![format!(
-        "{} ways of feeding it were tried on {pairs} rendered pairs of known disparity, {} x {} to the model; it ran with {}.",
-        verdict.tried[0], size[0], size[1], verdict.tried[1]
-    )];
-    lines.push(format!(
-        "It errs by {:.2} px, an answer without images by {:.2} px; correlation with the truth {:.3}; a right image moved by 1 px moves the answer by {:.2} px.",
-        verdict.error, verdict.blind_error, verdict.correlation, verdict.response
-    ));
-    if own {
-        lines.push("It is an export of barchan: confidence and sigma are its own.".into());
-    }
-    for d in &verdict.decisions {
-        let beside = match (&d.alternative, d.alternative_error) {
-            (Some(other), Some(error)) if d.decided => {
-                format!("{error:.2} px with the next best, {other}")
-            }
-            (Some(other), Some(error)) => {
-                format!("{other} makes no difference ({error:.2} px): the usual is taken")
-            }
-            (Some(other), None) => format!("the model does not run with {other}"),
-            (None, _) if own => "as every export of barchan".into(),
-            (None, _) => "the shapes of the inputs say so".into(),
-        };
-        lines.push(format!("{}: {}; {beside}", d.question, d.answer));
-    }
-    let free = |side: Option<usize>| side.map_or("any".into(), |s| s.to_string());
-    let s = &contract.size;
-    lines.push(if let (Some(width), Some(height)) = (s.width, s.height) {
-        format!("size: {width} x {height} only; images are resized to it and disparities back")
-    } else {
-        format!(
-            "size: {} x {}, padded to multiples of {}, at least {}; {}",
-            free(s.width),
-            free(s.height),
-            s.multiple,
-            s.at_least,
-            if s.batch {
-                "several pairs at once"
-            } else {
-                "one pair at a time"
-            }
-        )
-    });
-    let o = &contract.output;
-    lines.push(format!(
-        "output: \"{}\", axes {}, channel {}; disparity in {} is {} times the value (measured {:.4} to the pixel)",
-        o.name,
-        o.layout.letters(),
-        o.channel,
-        match o.unit {
-            Unit::Pixels => "pixels",
-            Unit::Width => "widths of the image",
-        },
-        o.factor,
-        verdict.measured_factor
-    ));
-    lines
 }
