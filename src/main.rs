@@ -39,6 +39,7 @@ struct Cli {
 enum Command {
     Train(commands::train::Args),
     Export(commands::export::Args),
+    Probe(commands::probe::Args),
     Infer(commands::infer::Args),
     Slam(commands::slam::Args),
     Map(commands::map::Args),
@@ -55,6 +56,7 @@ fn main() -> ExitCode {
     let result = match cli.command {
         Command::Train(args) => commands::train::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output, runtime),
+        Command::Probe(args) => commands::probe::run(args, &output, runtime),
         Command::Infer(args) => commands::infer::run(args, &output, runtime),
         Command::Slam(args) => commands::slam::run(args, &output, runtime),
         Command::Map(args) => commands::map::run(args, &output),

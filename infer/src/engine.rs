@@ -34,11 +34,33 @@ pub trait DisparityEngine: Send {
     /// # Errors
     /// When the sizes differ, or the engine fails.
     fn disparity(&mut self, left: &Rgb, right: &Rgb) -> Result<DisparityMap, InferError>;
+
+    /// Disparity of several pairs `(left, right)`, each as [`Self::disparity`] gives it; of any sizes.
+    /// Engines that run several at once do so.
+    ///
+    /// # Errors
+    /// When the sizes of a pair differ, or the engine fails.
+    fn disparity_batch(&mut self, pairs: &[(&Rgb, &Rgb)]) -> Result<Vec<DisparityMap>, InferError> {
+        pairs
+            .iter()
+            .map(|(left, right)| self.disparity(left, right))
+            .collect()
+    }
+
+    /// Runs a flat pair of the size that is to come, so that what is done once, for this size, is done
+    /// before anybody counts time.
+    ///
+    /// # Errors
+    /// When the size is 0, or the engine fails.
+    fn warm_up(&mut self, width: u32, height: u32) -> Result<(), InferError> {
+        let flat = Rgb::from_pixel(width, height, image::Rgb([0.5; 3]));
+        self.disparity(&flat, &flat).map(drop)
+    }
 }
 
 impl DisparityMap {
     /// From the three outputs of a network, each one value a pixel, row by row.
-    #[cfg(any(feature = "burn", feature = "onnxruntime"))]
+    #[cfg(feature = "burn")]
     pub(crate) fn from_network(
         engine: &str,
         (width, height): (u32, u32),

@@ -2,9 +2,10 @@
 //!
 //! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
 //! line see disparity, whoever makes it; [`SemiGlobal`] and [`BlockMatching`], which need no model;
-//! [`Rejection`], which marks as unknown what the pair itself
-//! contradicts. Engines stand behind features: `burn`, `onnxruntime`. With the
-//! latter, `quantize` makes an int8 network out of a float one.
+//! [`Rejection`], which marks as unknown what the pair itself contradicts. Engines stand behind
+//! features: `burn`, `onnxruntime`. With the latter, `probe` finds out what somebody else's ONNX file
+//! wants and means, a `Contract` (`x.toml` beside `x.onnx`) keeps it for `OnnxEngine`, and `quantize`
+//! makes an int8 network out of a float one.
 //!
 //! What it promises: any image size; disparity positive (`x_right = x_left - d`), NaN is unknown.
 //!
@@ -17,6 +18,8 @@ mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
 #[cfg(feature = "onnxruntime")]
+mod probe;
+#[cfg(feature = "onnxruntime")]
 mod quantize;
 mod rejection;
 
@@ -25,7 +28,12 @@ pub use burn_engine::BurnEngine;
 pub use classical::{BlockMatching, SemiGlobal};
 pub use engine::{DisparityEngine, DisparityMap, InferError};
 #[cfg(feature = "onnxruntime")]
-pub use onnxruntime::{OnnxEngine, Runtime};
+pub use onnxruntime::{
+    Channels, Contract, ImageFormat, InputFormat, Layout, ModelSize, OnnxEngine, OutputFormat,
+    OutputLayout, Runtime, Side, Unit,
+};
+#[cfg(feature = "onnxruntime")]
+pub use probe::{Decision, Verdict, probe};
 #[cfg(feature = "onnxruntime")]
 pub use quantize::{QuantizeError, QuantizeOptions, Quantized, quantize};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};

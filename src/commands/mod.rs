@@ -6,6 +6,7 @@ pub mod eval;
 pub mod export;
 pub mod infer;
 pub mod map;
+pub mod probe;
 pub mod raster;
 pub mod slam;
 pub mod train;
