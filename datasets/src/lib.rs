@@ -37,7 +37,7 @@ pub use formats::folder::Folder;
 pub use image_file::read_rgb;
 pub use open::{dataset_folder, open, open_as_stored};
 pub use pairs::PairSource;
-pub use prefetch::{Prefetch, prefetch};
+pub use prefetch::{Prefetch, prefetch, prefetch_with};
 pub use sensors::{GnssFix, ImuSample, OdometrySample, Sensors};
 pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
 pub use synth::Synth;

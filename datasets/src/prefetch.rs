@@ -10,21 +10,30 @@ use crate::{DataError, StereoFrame, StereoSource};
 /// A frame that cannot be read is an `Err` in its place and the iterator goes on. Dropping it
 /// stops the threads, each after the frame in hand.
 pub fn prefetch(source: Arc<dyn StereoSource>, order: Vec<usize>, ahead: usize) -> Prefetch {
+    prefetch_with(order, ahead, move |index| source.frame(index))
+}
+
+/// As [`prefetch`], with whatever `read` makes of an index: a frame and its truth, say.
+pub fn prefetch_with<T: Send + 'static>(
+    order: Vec<usize>,
+    ahead: usize,
+    read: impl Fn(usize) -> Result<T, DataError> + Send + Sync + 'static,
+) -> Prefetch<T> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = cores.min(4).min(ahead).max(1);
     // A thread holds one finished frame in hand besides those in its channel.
     let queued = (ahead / threads).saturating_sub(1);
-    let order: Arc<[usize]> = order.into();
+    let (order, read): (Arc<[usize]>, _) = (order.into(), Arc::new(read));
     // Thread k reads every threads-th frame from the k-th into a channel of its own, so that
     // taking from the channels in turn restores the order.
     let (channels, workers) = (0..threads)
         .map(|k| {
             let (send, receive) = sync_channel(queued);
-            let (source, order) = (Arc::clone(&source), Arc::clone(&order));
+            let (read, order) = (Arc::clone(&read), Arc::clone(&order));
             let worker = std::thread::spawn(move || {
                 for index in order.iter().skip(k).step_by(threads) {
                     // The receiver is gone: nobody wants more.
-                    if send.send(source.frame(*index)).is_err() {
+                    if send.send(read(*index)).is_err() {
                         return;
                     }
                 }
@@ -40,16 +49,16 @@ pub fn prefetch(source: Arc<dyn StereoSource>, order: Vec<usize>, ahead: usize) 
     }
 }
 
-/// What [`prefetch`] returns.
-pub struct Prefetch {
-    channels: Vec<Receiver<Result<StereoFrame, DataError>>>,
+/// What [`prefetch`] and [`prefetch_with`] return.
+pub struct Prefetch<T = StereoFrame> {
+    channels: Vec<Receiver<Result<T, DataError>>>,
     workers: Vec<JoinHandle<()>>,
     order: Arc<[usize]>,
     next: usize,
 }
 
-impl Iterator for Prefetch {
-    type Item = Result<StereoFrame, DataError>;
+impl<T> Iterator for Prefetch<T> {
+    type Item = Result<T, DataError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let index = *self.order.get(self.next)?;
@@ -69,9 +78,9 @@ impl Iterator for Prefetch {
     }
 }
 
-impl ExactSizeIterator for Prefetch {}
+impl<T> ExactSizeIterator for Prefetch<T> {}
 
-impl Drop for Prefetch {
+impl<T> Drop for Prefetch<T> {
     fn drop(&mut self) {
         self.channels.clear();
         for worker in self.workers.drain(..) {
