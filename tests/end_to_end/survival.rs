@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use crate::program::{barchan, rendered, text};
 
 /// Steps of a run that is killed.
-const STEPS: usize = 36;
+const STEPS: usize = 24;
 
 /// A run small enough to be killed often, with everything a checkpoint must hold: averaged weights,
 /// a rate that drops on the way, flips and asymmetric colours.
 fn arguments(data: &Path, out: &Path) -> Vec<String> {
     let words = [
         "train --epochs 9 --drop-epoch 3 --crop 64 96 --max-disparity 32 --batch 1 --average 0.9",
-        "--checkpoint-every 3 --validate-every 8 --flip-swap 0.5 --flip-vertical 0.5 --asymmetric 0.5 --blur 1",
+        "--checkpoint-every 3 --validate-every 7 --flip-swap 0.5 --flip-vertical 0.5 --asymmetric 0.5 --blur 1",
         &format!("--steps {STEPS} --data {} --out {}", text(data), text(out)),
     ];
     words
@@ -119,9 +119,9 @@ fn killed_at_any_moment_it_comes_to_the_same_weights() {
         let mut child = spawn(&args);
         // Some lines on, and then anywhere in a step, a checkpoint or a validation; in the first
         // round before there is anything.
-        let more = if round == 0 { 0 } else { 1 + dice(8) as usize };
+        let more = if round == 0 { 0 } else { 1 + dice(6) as usize };
         let alive = wait_for_lines(&mut child, &run, more);
-        std::thread::sleep(Duration::from_micros(dice(120_000)));
+        std::thread::sleep(Duration::from_micros(dice(80_000)));
         if alive && child.try_wait().unwrap().is_none() {
             child.kill().unwrap();
             child.wait().unwrap();

@@ -255,10 +255,19 @@ mod tests {
 
     /// A pair of the same pattern in both images.
     fn pair() -> [Vec<f32>; 2] {
+        let mut rng = ChaCha8Rng::seed_from_u64(99);
         let image: Vec<f32> = (0..3 * SIZE[0] * SIZE[1])
-            .map(|i| ((i * 7919) % 256) as f32 / 255.0)
+            .map(|_| rng.random_range(0.0..1.0))
             .collect();
         [image.clone(), image]
+    }
+
+    /// Of how many values two images differ by more than rounding.
+    fn different(a: &[f32], b: &[f32]) -> usize {
+        a.iter()
+            .zip(b)
+            .filter(|(a, b)| (*a - *b).abs() > 1e-6)
+            .count()
     }
 
     fn changed(augmentation: Augmentation, seed: u64) -> [Vec<f32>; 2] {
@@ -270,7 +279,9 @@ mod tests {
 
     #[test]
     fn nothing_changes_nothing() {
-        assert_eq!(changed(nothing(), 1), pair());
+        let (after, before) = (changed(nothing(), 1), pair());
+        assert_eq!(different(&after[0], &before[0]), 0);
+        assert_eq!(different(&after[1], &before[1]), 0);
     }
 
     #[test]
@@ -327,11 +338,11 @@ mod tests {
         for seed in 0..50 {
             let [left, right] = changed(always, seed);
             let [before, _] = pair();
-            assert_eq!(left, before);
+            assert_eq!(different(&left, &before), 0);
             let plane = SIZE[0] * SIZE[1];
-            let gone = (0..plane).filter(|i| right[*i] != before[*i]).count();
-            // One or two patches of 50 to 60 by 40 pixels, less what kept its value by chance.
-            assert!((1900..=4800).contains(&gone), "seed {seed}: {gone}");
+            let gone = different(&right[..plane], &before[..plane]);
+            // One or two patches of 50 to 60 by 40 pixels.
+            assert!((1990..=4800).contains(&gone), "seed {seed}: {gone}");
         }
     }
 
