@@ -16,6 +16,8 @@ CARGO_FLAGS ?=
 CARGO_BUILD  = --release --workspace $(CARGO_FLAGS)
 
 BARCHAN := $(CARGO_TARGET_DIR)/release/barchan
+# What `make libtorch` leaves.
+TORCH = $(CACHE)/libtorch/2.9.1
 # What `make run` works on, and where it writes.
 DATA = synth:seed=1,frames=40
 OUT  = runs/demo
@@ -23,7 +25,7 @@ OUT  = runs/demo
 PEERS := $(CACHE)/peers-$(shell sha256sum tests/peers/requirements.txt | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke peers onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch peers onnxruntime libtorch sample-data clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -39,6 +41,17 @@ test: onnxruntime ## every test
 
 smoke: onnxruntime ## train for a moment on each CPU device, export, ONNX Runtime against Burn
 	cargo test $(CARGO_BUILD) --test end_to_end smoke -- --nocapture
+
+# libtorch's other features of the network library would compile all of it again in the build folder
+# of everything else: it has a folder of its own. The path to libtorch goes into the program; the
+# tests of the library crates find it by the variable.
+tch: export CARGO_TARGET_DIR := $(CARGO_TARGET_DIR)-tch
+tch: export LIBTORCH := $(TORCH)
+tch: export LD_LIBRARY_PATH := $(TORCH)/lib:$(LD_LIBRARY_PATH)
+tch: onnxruntime libtorch ## the program with libtorch for train --device tch, and a few steps on it (15 minutes)
+	cargo build $(CARGO_BUILD) --features tch
+	cargo test $(CARGO_BUILD) --features tch --test end_to_end smoke::tch -- --nocapture
+	@echo "with libtorch: $(CARGO_TARGET_DIR)/release/barchan"
 
 lint: ## format, clippy and documentation, warnings denied
 	cargo fmt --all --check

@@ -54,7 +54,10 @@ fn main() -> ExitCode {
     let output = output::Output { json: cli.json };
     let runtime = cli.onnxruntime.as_deref();
     let result = match cli.command {
-        Command::Train(args) => commands::train::run(args, &output),
+        Command::Train(args) => match commands::train::run(args, &output) {
+            Ok(false) => return ExitCode::from(commands::train::INTERRUPTED),
+            other => other.map(|_| ()),
+        },
         Command::Export(args) => commands::export::run(args, &output, runtime),
         Command::Probe(args) => commands::probe::run(args, &output, runtime),
         Command::Infer(args) => commands::infer::run(args, &output, runtime),

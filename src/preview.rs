@@ -3,24 +3,27 @@
 use barchan_datasets::check::Report;
 use barchan_datasets::{Plane, Rgb, StereoFrame};
 use barchan_geometry::nalgebra::{Matrix3, Vector3};
-use image::RgbImage;
+use barchan_train::Explained;
 use image::imageops::{FilterType, replace, resize};
+use image::{ImageError, ImageFormat, RgbImage};
 
 /// The left image beside its disparity in colour: far is blue, near is red, unknown is black.
 /// `range` fixes the colours, so that the frames of a sequence compare.
 pub fn disparity_beside_image(left: &Rgb, disparity: &Plane, range: (f32, f32)) -> RgbImage {
     let (width, height) = left.dimensions();
-    let (low, high) = range;
     RgbImage::from_fn(2 * width, height, |x, y| {
         if x < width {
             return byte(left.get_pixel(x, y));
         }
-        let d = disparity.get_pixel(x - width, y).0[0];
-        if !d.is_finite() {
-            return image::Rgb([0; 3]);
-        }
-        turbo((d - low) / (high - low).max(1e-6))
+        disparity_colour(disparity.get_pixel(x - width, y).0[0], range)
     })
+}
+
+fn disparity_colour(disparity: f32, (low, high): (f32, f32)) -> image::Rgb<u8> {
+    match disparity.is_finite() {
+        true => turbo((disparity - low) / (high - low).max(1e-6)),
+        false => image::Rgb([0; 3]),
+    }
 }
 
 /// Left image, right image and true disparity (black where unknown) of each pair, a pair a row.
@@ -62,6 +65,60 @@ pub fn contact_sheet(pairs: &[(StereoFrame, Option<Plane>)]) -> RgbImage {
         y += i64::from(row[0].height());
     }
     sheet
+}
+
+/// What a network makes of pairs, a pair a row: the left image, its disparity, the right image warped
+/// by it (which should look like the left), and in red what is wrong: the error where the truth is
+/// known, full red at [`FULL_ERROR`], else how far the warped image is from the left one.
+pub fn explained_sheet(pairs: &[Explained]) -> RgbImage {
+    let rows: Vec<[RgbImage; 4]> = pairs
+        .iter()
+        .map(|pair| {
+            let (left, disparity) = (&pair.frame.left, &pair.disparity);
+            // The truth's colours where there is one, so that pictures of a run compare.
+            let range = disparity_range(pair.truth.as_ref().unwrap_or(disparity));
+            let (width, height) = left.dimensions();
+            let coloured = RgbImage::from_fn(width, height, |x, y| {
+                disparity_colour(disparity.get_pixel(x, y).0[0], range)
+            });
+            let wrong = RgbImage::from_fn(width, height, |x, y| {
+                let share = match &pair.truth {
+                    Some(truth) => {
+                        let error = disparity.get_pixel(x, y).0[0] - truth.get_pixel(x, y).0[0];
+                        error.abs() / FULL_ERROR
+                    }
+                    None => {
+                        let (a, b) = (left.get_pixel(x, y).0, pair.warped.get_pixel(x, y).0);
+                        a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum()
+                    }
+                };
+                // Unknown is black: NaN becomes 0.
+                image::Rgb([(255.0 * share.clamp(0.0, 1.0)) as u8, 0, 0])
+            });
+            [bytes(left), coloured, bytes(&pair.warped), wrong]
+        })
+        .collect();
+    let column = rows.iter().map(|row| row[0].width()).max().unwrap_or(1);
+    let height: u32 = rows.iter().map(|row| row[0].height()).sum();
+    let mut sheet = RgbImage::new(4 * column, height.max(1));
+    let mut y = 0;
+    for row in &rows {
+        for (k, image) in row.iter().enumerate() {
+            replace(&mut sheet, image, (k as u32 * column).into(), y);
+        }
+        y += i64::from(row[0].height());
+    }
+    sheet
+}
+
+/// An error of so many pixels is drawn in full red.
+const FULL_ERROR: f32 = 5.0;
+
+/// A picture as the bytes of a PNG file.
+pub fn png(image: &RgbImage) -> Result<Vec<u8>, ImageError> {
+    let mut bytes = std::io::Cursor::new(vec![]);
+    image.write_to(&mut bytes, ImageFormat::Png)?;
+    Ok(bytes.into_inner())
 }
 
 /// The matches of one frame: above, where they lie in the left and in the right image; below, how far

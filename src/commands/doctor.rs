@@ -15,29 +15,21 @@ pub struct Args {}
 
 #[derive(Serialize)]
 struct Check {
-    name: &'static str,
+    name: String,
     works: bool,
     detail: String,
 }
 
 pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
-    let check = |name, result: Result<String>| Check {
-        name,
+    let check = |name: &str, result: Result<String>| Check {
+        name: name.to_owned(),
         works: result.is_ok(),
         detail: result.unwrap_or_else(|e| format!("{e:#}")),
     };
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let checks = [
+    let mut checks = vec![
         check("processor", Ok(format!("{cores} cores"))),
         check("shipped weights with Burn", try_shipped()),
-        check(
-            "train --device flex",
-            Ok(format!("{:?}", DeviceName::Flex.device())),
-        ),
-        check(
-            "train --device ndarray",
-            Ok(format!("{:?}", DeviceName::Ndarray.device())),
-        ),
         check(
             "ONNX Runtime",
             Runtime::load(runtime)
@@ -45,6 +37,15 @@ pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
                 .map_err(Into::into),
         ),
     ];
+    checks.extend(DeviceName::ALL.map(|device| {
+        check(
+            &format!("train --device {}", device.name()),
+            device
+                .device()
+                .map(|d| format!("{d:?}"))
+                .map_err(Into::into),
+        )
+    }));
     let text: String = checks
         .iter()
         .map(|c| {

@@ -4,4 +4,6 @@ mod bad_input;
 mod chain;
 mod data;
 mod program;
+mod settings;
 mod smoke;
+mod survival;

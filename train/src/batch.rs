@@ -86,7 +86,7 @@ impl Batch {
             images[0].extend(&left);
             images[1].extend(&right);
             if let Some(augmentation) = augmentation {
-                augmentation.apply([&mut left, &mut right], rng);
+                augmentation.apply([&mut left, &mut right], [width, height], rng);
             }
             images[2].append(&mut left);
             images[3].append(&mut right);
@@ -242,6 +242,7 @@ mod tests {
             contrast: 0.0,
             channel: 0.0,
             disparity: 20,
+            ..Augmentation::default()
         };
         let mut added = Vec::new();
         for seed in 0..20 {

@@ -27,16 +27,18 @@ pub enum TrainError {
     /// The configuration asks for what cannot be.
     #[error("{0}")]
     Config(String),
-    /// The loss is no longer a number.
+    /// What training computes is no longer a number.
     #[error(
-        "step {step}: the loss is {loss} on {frames}\n  cure: resume from the last checkpoint with a lower --lr, and look at these frames"
+        "step {step}: {what} is {value} on {frames}\n  cure: look at these frames; resume from the last checkpoint, or start again with a lower --lr"
     )]
     NotFinite {
         /// The step, from 1.
         step: usize,
-        /// Its loss.
-        loss: f32,
-        /// The frames of the batch.
+        /// What is no number: the loss, the gradient, the weights.
+        what: &'static str,
+        /// What it is instead.
+        value: f32,
+        /// The frames of the batch, each with its data set.
         frames: String,
     },
 }

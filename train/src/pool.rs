@@ -1,27 +1,33 @@
+use std::iter::repeat_with;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use barchan_datasets::{DataError, Plane, Prefetch, StereoFrame, StereoSource, prefetch_with};
-use barchan_geometry::{RectifiedRig, Se3, Trajectory};
+use barchan_geometry::{Se3, Trajectory};
 use barchan_infer::{DisparityEngine, SemiGlobal};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
+use crate::augment::Flips;
 use crate::batch::{Moment, Sample};
 use crate::{TrainConfig, TrainError};
 
 /// Smallest side of an image that can be trained on: the windows of the terms need some.
 const SMALLEST: u32 = 16;
 
+/// Keeps the draws of flips apart from those of crops, which use the same seed.
+const FLIPS: u64 = 0x666c_6970;
+
 /// Several sources as one, frame after frame, with what else a configuration wants of each.
 pub(crate) struct Pool {
-    sources: Vec<Box<dyn StereoSource>>,
-    /// Whether true disparity is wanted.
-    truth: bool,
-    /// How many frames away neighbours are; 0 is none.
-    neighbours: usize,
-    /// Disparities that are searched for proxies, if those are wanted.
-    proxies: Option<usize>,
+    /// Each with what it was opened by.
+    sources: Vec<(String, Box<dyn StereoSource>)>,
+    config: TrainConfig,
     /// Matchers not in use: their memory is kept.
     matchers: Mutex<Vec<SemiGlobal>>,
 }
+
+/// A whole pair, and its true disparity where that is known.
+pub(crate) type Whole = (StereoFrame, Option<Plane>);
 
 impl Pool {
     /// # Errors
@@ -33,11 +39,11 @@ impl Pool {
         if sources.iter().all(|s| s.is_empty()) {
             return Err(TrainError::Config("there are no frames to train on".into()));
         }
-        let loss = &config.loss;
-        if loss.neighbours > 0 {
-            for (k, source) in sources.iter().enumerate() {
+        let specs = config.data.iter().cloned().chain(repeat_with(String::new));
+        let sources: Vec<_> = specs.zip(sources).collect();
+        if config.loss.neighbours > 0 {
+            for (data, source) in &sources {
                 check_poses(source.true_trajectory()).map_err(|found| {
-                    let data = config.data.get(k).map_or("the data", String::as_str);
                     TrainError::Config(format!(
                         "loss: neighbours need the pose of every frame, and {data} has {found}\n  cure: `barchan slam --data {data} --out RUN` makes some: put its trajectory.tum beside the images as groundtruth.tum; or leave neighbours away"
                     ))
@@ -46,27 +52,49 @@ impl Pool {
         }
         Ok(Self {
             sources,
-            truth: config.supervised,
-            neighbours: loss.neighbours,
-            proxies: (loss.proxies > 0.0).then_some(config.net.max_disparity),
+            config: config.clone(),
             matchers: Mutex::default(),
         })
     }
 
-    /// Reads samples ahead on threads, in the order asked for: reading, rendering and matching overlap
-    /// with training.
-    pub fn prefetch(
+    /// How many frames there are.
+    pub fn len(&self) -> usize {
+        self.sources.iter().map(|(_, s)| s.len()).sum()
+    }
+
+    /// Reads (or renders) pairs on threads ahead of their use, in the order asked for: as they are,
+    /// with truth where there is any.
+    pub fn whole(self: &Arc<Self>, order: Vec<usize>) -> Prefetch<Whole, TrainError> {
+        let pool = Arc::clone(self);
+        let read = move |index| {
+            let (_, source, local) = pool.find(index)?;
+            Ok((pool.frame(index)?, source.true_disparity(local)?))
+        };
+        prefetch_with(read, order, 2)
+    }
+
+    /// The same for training: pairs with all that is wanted of them, so that reading, rendering and
+    /// matching overlap with it. `order` holds the number of the draw and the frame: what a draw gives
+    /// depends on its number and the seed only, so that a resumed run sees what an uninterrupted one would.
+    pub fn training(
         self: &Arc<Self>,
-        order: Vec<usize>,
+        order: Vec<(u64, usize)>,
         ahead: usize,
     ) -> Prefetch<Sample, TrainError> {
         let pool = Arc::clone(self);
-        prefetch_with(move |index| pool.sample(index), order, ahead)
+        let places = (0..order.len()).collect();
+        let read = move |place: usize| {
+            let (draw, index) = order[place];
+            let mut rng = ChaCha8Rng::seed_from_u64(pool.config.seed ^ FLIPS);
+            rng.set_stream(draw);
+            pool.sample(index, pool.config.augmentation.draw_flips(&mut rng))
+        };
+        prefetch_with(read, places, ahead)
     }
 
-    /// A frame with all that is wanted of it.
-    pub fn sample(&self, index: usize) -> Result<Sample, TrainError> {
-        let (source, local) = self.find(index)?;
+    /// A frame turned by `flips`, with all that is wanted of it.
+    fn sample(&self, index: usize, mut flips: Flips) -> Result<Sample, TrainError> {
+        let (_, source, local) = self.find(index)?;
         let frame = self.frame(index)?;
         if frame.left.width().min(frame.left.height()) < SMALLEST {
             return Err(TrainError::Config(format!(
@@ -76,41 +104,65 @@ impl Pool {
                 frame.left.height()
             )));
         }
+        let mut truth = None;
+        if self.config.supervised && flips.swap {
+            truth = source.true_disparity_right(local)?;
+            flips.swap = truth.is_some();
+        }
+        if self.config.supervised && !flips.swap {
+            truth = source.true_disparity(local)?;
+        }
+        let neighbours = match self.config.loss.neighbours {
+            0 => vec![],
+            n => vec![
+                neighbour(source, &frame, local, local.checked_sub(n))?,
+                neighbour(source, &frame, local, local.checked_add(n))?,
+            ],
+        };
+        let (frame, truth) = flips.apply(frame, truth);
+        let proxy = match self.config.loss.proxies > 0.0 {
+            true => Some(self.proxy(&frame)?),
+            false => None,
+        };
         Ok(Sample {
             rig: *source.frame_rig(local),
-            truth: match self.truth {
-                true => source.true_disparity(local)?,
-                false => None,
-            },
-            proxy: match self.proxies {
-                Some(range) => Some(self.proxy(&frame, range)?),
-                None => None,
-            },
-            neighbours: match self.neighbours {
-                0 => vec![],
-                n => vec![
-                    neighbour(source, &frame, local, local.checked_sub(n))?,
-                    neighbour(source, &frame, local, local.checked_add(n))?,
-                ],
-            },
+            truth,
+            proxy,
+            neighbours,
             frame,
         })
     }
 
     /// Disparity of whole images by semi-global matching, NaN where left and right disagree.
-    fn proxy(&self, frame: &StereoFrame, range: usize) -> Result<Plane, TrainError> {
+    fn proxy(&self, frame: &StereoFrame) -> Result<Plane, TrainError> {
         let matchers = || self.matchers.lock().unwrap_or_else(PoisonError::into_inner);
         let idle = matchers().pop();
+        let range = self.config.net.max_disparity;
         let mut matcher = idle.unwrap_or_else(|| SemiGlobal::new(Some(range)));
         let map = matcher.disparity(&frame.left, &frame.right)?;
         matchers().push(matcher);
         Ok(map.disparity)
     }
 
-    fn find(&self, mut index: usize) -> Result<(&dyn StereoSource, usize), DataError> {
-        for source in &self.sources {
+    /// Frame `index` of all, its name completed by the data it is of.
+    fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
+        let (spec, source, local) = self.find(index)?;
+        let frame = source.frame(local)?;
+        Ok(StereoFrame {
+            index,
+            name: match spec {
+                "" => frame.name,
+                spec => format!("{} of {spec}", frame.name),
+            },
+            ..frame
+        })
+    }
+
+    /// What frame `index` of all is of, and its number there.
+    fn find(&self, mut index: usize) -> Result<(&str, &dyn StereoSource, usize), DataError> {
+        for (spec, source) in &self.sources {
             if index < source.len() {
-                return Ok((source.as_ref(), index));
+                return Ok((spec, source.as_ref(), index));
             }
             index -= source.len();
         }
@@ -170,55 +222,27 @@ fn check_poses(trajectory: Option<&Trajectory>) -> Result<(), &'static str> {
     }
 }
 
-impl StereoSource for Pool {
-    /// That of the first source.
-    fn rig(&self) -> &RectifiedRig {
-        self.sources[0].rig()
-    }
-
-    fn len(&self) -> usize {
-        self.sources.iter().map(|s| s.len()).sum()
-    }
-
-    fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
-        let (source, local) = self.find(index)?;
-        // The caller asks by the pool's index and finds the frame again by it.
-        Ok(StereoFrame {
-            index,
-            ..source.frame(local)?
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Augmentation, DeviceName, Loss, Schedule};
     use barchan_datasets::Synth;
-    use barchan_geometry::StampedPose;
+    use barchan_geometry::{RectifiedRig, StampedPose};
     use barchan_model::Preset;
 
     fn pool(
         source: impl StereoSource + 'static,
         change: fn(&mut TrainConfig),
     ) -> Result<Arc<Pool>, TrainError> {
-        let mut config = TrainConfig {
-            data: vec!["some/images".into()],
-            init: None,
-            device: DeviceName::Flex,
-            seed: 1,
-            supervised: false,
-            batch: 1,
-            crop: [64, 96],
-            checkpoint_every: 1,
-            net: Preset::Tiny.config(),
-            schedule: Schedule::FINETUNE,
-            loss: Loss::default(),
-            augmentation: Augmentation::default(),
-        };
+        let mut config = TrainConfig::new(Preset::Tiny.config());
+        config.data = vec!["some/images".into()];
         change(&mut config);
         Ok(Arc::new(Pool::new(vec![Box::new(source)], &config)?))
     }
+
+    const UNTURNED: Flips = Flips {
+        vertical: false,
+        swap: false,
+    };
 
     fn synth(spec: &str) -> Synth {
         Synth::parse(spec).unwrap()
@@ -227,7 +251,7 @@ mod tests {
     #[test]
     fn only_what_is_wanted_is_made() {
         let plain = pool(synth("frames=1,width=96,height=64"), |_| ()).unwrap();
-        let sample = plain.sample(0).unwrap();
+        let sample = plain.sample(0, UNTURNED).unwrap();
         assert!(sample.truth.is_none() && sample.proxy.is_none() && sample.neighbours.is_empty());
     }
 
@@ -237,7 +261,7 @@ mod tests {
             (c.supervised, c.loss.proxies) = (true, 0.1);
         })
         .unwrap();
-        let sample = pool.prefetch(vec![0], 1).next().unwrap().unwrap();
+        let sample = pool.training(vec![(0, 0)], 1).next().unwrap().unwrap();
         let (truth, proxy) = (sample.truth.unwrap(), sample.proxy.unwrap());
         let (mut known, mut both, mut near) = (0, 0, 0);
         for (t, p) in truth.as_raw().iter().zip(proxy.as_raw()) {
@@ -256,7 +280,7 @@ mod tests {
         })
         .unwrap();
         for index in 0..4 {
-            let sample = pool.sample(index).unwrap();
+            let sample = pool.sample(index, UNTURNED).unwrap();
             let there: Vec<bool> = sample.neighbours.iter().map(Option::is_some).collect();
             assert_eq!(there, [index >= 2, index + 2 < 4], "{index}");
             let moment = sample.neighbours.iter().flatten().next().unwrap();
@@ -327,7 +351,7 @@ mod tests {
             }
         }
         let pool = pool(Tiny(synth("frames=1,width=96,height=64")), |_| ()).unwrap();
-        let refused = pool.sample(0).err().unwrap().to_string();
+        let refused = pool.sample(0, UNTURNED).err().unwrap().to_string();
         assert!(
             refused.contains("strip") && refused.contains("3 x 40"),
             "{refused}"

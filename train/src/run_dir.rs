@@ -15,10 +15,18 @@ pub struct RunDir {
     root: PathBuf,
 }
 
-/// Network, optimiser, and the step and state of the checkpoint they came from.
-pub(crate) type Restored<S> = (StereoNet, ModuleOptimizer, Option<(usize, S)>);
+/// What a checkpoint holds beside numbers.
+pub(crate) struct Saved {
+    pub net: StereoNet,
+    /// The moving average of its weights, where there is one.
+    pub average: Option<StereoNet>,
+    pub optimizer: ModuleOptimizer,
+}
 
-/// One line of `log.jsonl`.
+/// What was saved, and the step and state of the checkpoint that it came from.
+pub(crate) type Restored<S> = (Saved, Option<(usize, S)>);
+
+/// A line of `log.jsonl`: one step. (The lines of a validation are [`Scored`](crate::Scored).)
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct LogLine {
     /// Steps done, this one included.
@@ -32,8 +40,14 @@ pub struct LogLine {
     /// The terms, unweighted; those that are off are absent.
     #[serde(flatten)]
     pub terms: LossTerms,
+    /// Euclidean norm of the gradient before it was clipped.
+    pub gradient: f32,
     /// Seconds the step took.
     pub seconds: f64,
+    /// Seconds it waited for its images before that.
+    pub waited: f64,
+    /// Its frames, each with its data set.
+    pub frames: String,
 }
 
 impl RunDir {
@@ -89,6 +103,23 @@ impl RunDir {
         .is_ok_and(|steps| steps.is_empty())
     }
 
+    /// Removes what a run left, and the directory if nothing else is in it.
+    pub fn discard(root: &Path) {
+        // What cannot be removed stays: there is an error to be told already.
+        for file in [
+            "config.toml",
+            "log.jsonl",
+            "summary.json",
+            "weights.safetensors",
+        ] {
+            let _ = std::fs::remove_file(root.join(file));
+        }
+        for folder in ["checkpoints", "samples"] {
+            let _ = std::fs::remove_dir_all(root.join(folder));
+        }
+        let _ = std::fs::remove_dir(root);
+    }
+
     /// Where it is.
     pub fn root(&self) -> &Path {
         &self.root
@@ -98,7 +129,7 @@ impl RunDir {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn log(&self, line: &LogLine) -> Result<(), TrainError> {
+    pub(crate) fn log(&self, line: &impl Serialize) -> Result<(), TrainError> {
         let mut text = serde_json::to_string(line).map_err(|e| self.error("log.jsonl", e))?;
         text.push('\n');
         std::fs::OpenOptions::new()
@@ -118,71 +149,96 @@ impl RunDir {
         self.write("summary.json", &text)
     }
 
-    /// Writes weights and optimiser so that a run can go on after `step`, with whatever else the
-    /// caller must remember; older checkpoints go.
+    /// Writes a file under `samples/`, all or nothing.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn sample(&self, name: &str, bytes: &[u8]) -> Result<(), TrainError> {
+        let folder = self.path("samples");
+        std::fs::create_dir_all(&folder).map_err(|e| self.error("samples", e))?;
+        Ok(weights::write_atomically(&folder.join(name), bytes)?)
+    }
+
+    /// Writes what a run needs to go on after `step`, with whatever else the caller must remember,
+    /// and `net` as the weights of the run; older checkpoints go.
+    ///
+    /// Killed between any two lines, it leaves a checkpoint to go on from, and weights that are those
+    /// of the newest checkpoint or newer: going on writes the same weights again.
     pub(crate) fn checkpoint(
         &self,
         step: usize,
+        saved: &Saved,
         net: &StereoNet,
-        optimizer: &ModuleOptimizer,
         state: &impl Serialize,
     ) -> Result<(), TrainError> {
         let name = format!("checkpoints/{step:08}");
         let (part, done) = (self.path(&format!("{name}.part")), self.path(&name));
-        let failed = |e: String| self.error(&name, e);
+        let failed = |e: &dyn std::fmt::Display| self.error(&name, e);
         if part.exists() {
-            std::fs::remove_dir_all(&part).map_err(|e| failed(e.to_string()))?;
+            std::fs::remove_dir_all(&part).map_err(|e| failed(&e))?;
         }
-        std::fs::create_dir_all(&part).map_err(|e| failed(e.to_string()))?;
-        net.clone()
-            .into_record()
-            .save(part.join("net.bpk"))
-            .map_err(|e| failed(e.to_string()))?;
-        optimizer
+        std::fs::create_dir_all(&part).map_err(|e| failed(&e))?;
+        let nets = [
+            ("net", Some(&saved.net)),
+            ("average", saved.average.as_ref()),
+        ];
+        for (name, net) in nets {
+            if let Some(net) = net {
+                net.clone()
+                    .into_record()
+                    .save(part.join(format!("{name}.bpk")))
+                    .map_err(|e| failed(&e))?;
+            }
+        }
+        saved
+            .optimizer
             .save(part.join("optimizer.bpk"))
-            .map_err(|e| failed(e.to_string()))?;
-        let state = serde_json::to_vec(state).map_err(|e| failed(e.to_string()))?;
-        std::fs::write(part.join("state.json"), state).map_err(|e| failed(e.to_string()))?;
-        if done.exists() {
-            std::fs::remove_dir_all(&done).map_err(|e| failed(e.to_string()))?;
-        }
-        std::fs::rename(&part, &done).map_err(|e| failed(e.to_string()))?;
+            .map_err(|e| failed(&e))?;
+        let state = serde_json::to_vec(state).map_err(|e| failed(&e))?;
+        std::fs::write(part.join("state.json"), state).map_err(|e| failed(&e))?;
         weights::save(net, &self.path("weights.safetensors"))?;
+        std::fs::rename(&part, &done).map_err(|e| failed(&e))?;
         for old in self.checkpoints()?.into_iter().filter(|s| *s < step) {
             std::fs::remove_dir_all(self.path(&format!("checkpoints/{old:08}")))
-                .map_err(|e| failed(e.to_string()))?;
+                .map_err(|e| failed(&e))?;
         }
         Ok(())
     }
 
-    /// The newest checkpoint; `None` when the run stopped before its first. Log lines past it go.
+    /// The newest checkpoint; no step when the run stopped before its first. Log lines past it go.
     pub(crate) fn restore<S: DeserializeOwned>(
         &self,
-        net: StereoNet,
-        optimizer: ModuleOptimizer,
+        mut into: Saved,
     ) -> Result<Restored<S>, TrainError> {
         let step = self.checkpoints()?.into_iter().max();
-        self.cut_log(step.unwrap_or(0))?;
+        self.cut_log(step)?;
         let Some(step) = step else {
-            return Ok((net, optimizer, None));
+            return Ok((into, None));
         };
         let name = format!("checkpoints/{step:08}");
-        let failed = |e: String| {
+        let failed = |e: &dyn std::fmt::Display| {
             self.error(
                 &name,
                 format!("{e}\n  cure: delete this checkpoint and resume again"),
             )
         };
         let folder = self.path(&name);
-        let record =
-            ModuleRecord::load(folder.join("net.bpk")).map_err(|e| failed(e.to_string()))?;
-        let net = net.load_record(record);
-        let optimizer = optimizer
+        let load = |net: StereoNet, file| {
+            let record = ModuleRecord::load(folder.join(file)).map_err(|e| failed(&e))?;
+            Ok::<_, TrainError>(net.load_record(record))
+        };
+        into.net = load(into.net, "net.bpk")?;
+        into.average = into
+            .average
+            .map(|average| load(average, "average.bpk"))
+            .transpose()?;
+        into.optimizer = into
+            .optimizer
             .load(folder.join("optimizer.bpk"))
-            .map_err(|e| failed(e.to_string()))?;
-        let state = std::fs::read(folder.join("state.json")).map_err(|e| failed(e.to_string()))?;
-        let state = serde_json::from_slice(&state).map_err(|e| failed(e.to_string()))?;
-        Ok((net, optimizer, Some((step, state))))
+            .map_err(|e| failed(&e))?;
+        let state = std::fs::read(folder.join("state.json")).map_err(|e| failed(&e))?;
+        let state = serde_json::from_slice(&state).map_err(|e| failed(&e))?;
+        Ok((into, Some((step, state))))
     }
 
     fn checkpoints(&self) -> Result<Vec<usize>, TrainError> {
@@ -193,13 +249,26 @@ impl RunDir {
             .collect())
     }
 
-    fn cut_log(&self, step: usize) -> Result<(), TrainError> {
+    /// Keeps the log lines of what the checkpoint after `step` holds: its steps, and the validations
+    /// before that of the same step, which a run that goes on repeats.
+    fn cut_log(&self, step: Option<usize>) -> Result<(), TrainError> {
+        /// What both kinds of line have, and what only one has.
+        #[derive(Deserialize)]
+        struct Line {
+            step: usize,
+            validation: Option<serde::de::IgnoredAny>,
+        }
         let Ok(text) = std::fs::read_to_string(self.path("log.jsonl")) else {
             return Ok(());
         };
         let kept: String = text
             .lines()
-            .filter(|l| serde_json::from_str::<LogLine>(l).is_ok_and(|l| l.step <= step))
+            .filter(|text| {
+                serde_json::from_str::<Line>(text).is_ok_and(|line| match line.validation {
+                    Some(_) => step.is_some_and(|step| line.step < step),
+                    None => step.is_some_and(|step| line.step <= step),
+                })
+            })
             .flat_map(|l| [l, "\n"])
             .collect();
         self.write("log.jsonl", kept.as_bytes())

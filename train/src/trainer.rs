@@ -1,10 +1,9 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use barchan_datasets::{StereoSource, prefetch};
-use barchan_model::{Device, NetConfig, StereoNet};
+use barchan_datasets::{Prefetch, StereoSource};
+use barchan_model::{Device, StereoNet};
 use burn::module::Module;
-use burn::optim::grad_clipping::GradientClippingConfig;
 use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::Tensor;
 use rand::SeedableRng;
@@ -13,137 +12,72 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::batch::Sample;
-use crate::loss::{self, Loss, View};
+use crate::loss::{self, View};
 use crate::pool::Pool;
-use crate::{Augmentation, Batch, LogLine, RunDir, TrainError};
+use crate::run_dir::Saved;
+use crate::validation::{Errors, to_plane};
+use crate::{Batch, Explained, LogLine, RunDir, Scored, TrainConfig, TrainError, Validation};
+use crate::{averaging, gradients};
 
-/// Where training runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum DeviceName {
-    /// Burn's own CPU kernels: the default.
-    Flex,
-    /// The `ndarray` crate on the CPU: slower, a second opinion.
-    Ndarray,
-}
-
-impl DeviceName {
-    /// The device, without gradients.
-    pub fn device(self) -> Device {
-        match self {
-            Self::Flex => Device::flex(),
-            // Deprecated in 0.22, whose version is pinned; wanted as a second opinion.
-            #[allow(deprecated)]
-            Self::Ndarray => Device::ndarray(),
-        }
+/// Who watches a run: told of what happens, and asked whether to go on.
+pub trait Observer {
+    /// A step was made.
+    fn step(&mut self, line: &LogLine) {
+        let _ = line;
     }
-}
 
-/// How long and how fast.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Schedule {
-    /// Passes over the data.
-    pub epochs: usize,
-    /// Learning rate.
-    pub lr: f64,
-    /// The learning rate is divided by ten from this epoch on.
-    pub drop_epoch: usize,
-    /// Stops after this many steps, where that is sooner.
-    pub steps: Option<usize>,
-}
-
-impl Schedule {
-    /// From nothing: 10 epochs at 1e-3, the last three at 1e-4 (Hong 2021, 4.2.1).
-    pub const PRETRAIN: Self = Self {
-        epochs: 10,
-        lr: 1e-3,
-        drop_epoch: 7,
-        steps: None,
-    };
-    /// From weights: one epoch at 1e-4 (Hong 2021, 4.2.1).
-    pub const FINETUNE: Self = Self {
-        epochs: 1,
-        lr: 1e-4,
-        drop_epoch: usize::MAX >> 1,
-        steps: None,
-    };
-}
-
-/// Everything that decides a run; written to `config.toml`.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainConfig {
-    /// The data, as given.
-    pub data: Vec<String>,
-    /// The weights started from; none is a random network.
-    pub init: Option<String>,
-    /// Where training runs.
-    pub device: DeviceName,
-    /// Seeds the network, the order of frames, crops and augmentation.
-    pub seed: u64,
-    /// Trains against true disparity (eq. 8) instead of the images alone.
-    pub supervised: bool,
-    /// Pairs a step.
-    pub batch: usize,
-    /// Height and width of the crops, pixels.
-    pub crop: [usize; 2],
-    /// Steps between checkpoints.
-    pub checkpoint_every: usize,
-    /// The network.
-    pub net: NetConfig,
-    /// How long and how fast.
-    pub schedule: Schedule,
-    /// Weights of eq. 1, and its options.
-    pub loss: Loss,
-    /// What is done to the images that the network sees.
-    pub augmentation: Augmentation,
-}
-
-impl TrainConfig {
-    /// Refuses what cannot be trained.
+    /// Held-out pairs were looked at; `best` is the best so far, this time included, and `pairs` are
+    /// the first few with what the network makes of them.
     ///
     /// # Errors
-    /// Says which field and what it should be.
-    pub fn check(&self) -> Result<(), TrainError> {
-        let refuse = |message: &str| Err(TrainError::Config(message.into()));
-        self.net.check()?;
-        self.loss.check(self.supervised)?;
-        if self.batch == 0 || self.checkpoint_every == 0 || self.schedule.epochs == 0 {
-            return refuse("batch, checkpoint_every and epochs must be at least 1");
-        }
-        if self.crop.iter().any(|n| *n < 32) {
-            return refuse("a crop must be at least 32 x 32 pixels");
-        }
-        if !(self.schedule.lr.is_finite() && self.schedule.lr > 0.0) {
-            return refuse("the learning rate must be above zero");
-        }
+    /// Whatever ends the run: a picture that cannot be written, say.
+    fn validated(
+        &mut self,
+        scored: &Scored,
+        best: &Scored,
+        pairs: &[Explained],
+    ) -> Result<(), TrainError> {
+        let _ = (scored, best, pairs);
         Ok(())
+    }
+
+    /// Whether to save a checkpoint and stop; asked after every step and every held-out pair.
+    fn stop(&mut self) -> bool {
+        false
     }
 }
 
-/// How well held-out pairs are explained.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub struct Validation {
-    /// How many pairs were held out.
-    pub frames: usize,
-    /// The photometric part of the loss, `a1 L_SSIM + a2 L_1` and the weighted census term where that
-    /// is on, mean over pairs; whole images, without options that choose pixels.
-    pub photometric: f32,
-    /// Mean (1 - SSIM) / 2.
-    pub ssim: f32,
-    /// Mean absolute difference.
-    pub l1: f32,
-    /// Mean census distance, where that is part of the loss.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub census: Option<f32>,
+/// Watches nothing.
+impl Observer for () {}
+
+/// How a run came to its end.
+#[derive(Clone, Copy, Debug)]
+pub enum Ended {
+    /// All steps are made.
+    Finished {
+        /// Held-out pairs before the first step.
+        before: Scored,
+        /// And after the last.
+        after: Scored,
+        /// The best of all validations.
+        best: Scored,
+    },
+    /// The observer stopped it; a checkpoint was saved.
+    Stopped {
+        /// Steps done.
+        step: usize,
+    },
 }
 
 /// What a checkpoint remembers beside weights and optimiser.
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Copy, Default, Serialize, Deserialize)]
 struct State {
-    before: Option<Validation>,
+    before: Option<Scored>,
+    best: Option<Scored>,
 }
+
+/// Of so many held-out pairs the observer gets pictures.
+const PICTURES: usize = 3;
 
 /// Runs the schedule. Its private `step` is figure 4 of the paper.
 pub struct Trainer {
@@ -152,12 +86,16 @@ pub struct Trainer {
     device: Device,
     pool: Arc<Pool>,
     net: StereoNet,
+    /// The moving average of the weights, where there is one; without gradients.
+    average: Option<StereoNet>,
     optimizer: ModuleOptimizer,
     training: Vec<usize>,
     held_out: Vec<usize>,
     /// Steps done.
     step: usize,
-    before: Option<Validation>,
+    /// The step of the checkpoint on disk.
+    saved: Option<usize>,
+    state: State,
 }
 
 impl Trainer {
@@ -173,13 +111,10 @@ impl Trainer {
         init: Option<StereoNet>,
     ) -> Result<Self, TrainError> {
         config.check()?;
-        // What cannot be trained on leaves no run behind.
+        // What can fail comes before anything is on disk.
+        config.device.device()?;
         let pool = Pool::new(sources, &config)?;
-        let mut trainer = Self::prepare(RunDir::create(root, &config)?, config, pool)?;
-        if let Some(init) = init {
-            trainer.net = init;
-        }
-        Ok(trainer)
+        Self::prepare(RunDir::create(root, &config)?, config, pool, init)
     }
 
     /// Goes on with the run in `root` from its last checkpoint. `sources` are those of its configuration.
@@ -194,45 +129,60 @@ impl Trainer {
         let (run, config) = RunDir::open(root)?;
         config.check()?;
         let pool = Pool::new(sources, &config)?;
-        let mut trainer = Self::prepare(run, config, pool)?;
-        if let Some(init) = init {
-            trainer.net = init;
-        }
-        let (net, optimizer, state) = trainer
-            .run
-            .restore::<State>(trainer.net, trainer.optimizer)?;
-        (trainer.net, trainer.optimizer) = (net, optimizer);
+        let mut trainer = Self::prepare(run, config, pool, init)?;
+        let saved = Saved {
+            net: trainer.net,
+            average: trainer.average,
+            optimizer: trainer.optimizer,
+        };
+        let (saved, state) = trainer.run.restore::<State>(saved)?;
+        (trainer.net, trainer.average) = (saved.net, saved.average);
+        trainer.optimizer = saved.optimizer;
         if let Some((step, state)) = state {
-            (trainer.step, trainer.before) = (step, state.before);
+            (trainer.step, trainer.state) = (step, state);
+            trainer.saved = Some(step);
         }
         Ok(trainer)
     }
 
-    fn prepare(run: RunDir, config: TrainConfig, pool: Pool) -> Result<Self, TrainError> {
+    fn prepare(
+        run: RunDir,
+        config: TrainConfig,
+        pool: Pool,
+        init: Option<StereoNet>,
+    ) -> Result<Self, TrainError> {
+        let pool = Arc::new(pool);
         let (training, held_out) = split(pool.len());
-        let device = config.device.device().autodiff();
-        let net = StereoNet::init(&config.net, config.seed, &device)?;
+        let device = config.device.device()?.autodiff();
+        let net = match init {
+            Some(net) => net,
+            None => StereoNet::init(&config.net, config.seed, &device)?,
+        };
+        // Clipping is done here, over all weights together: Burn's own is layer by layer.
         let optimizer = AdamConfig::new()
+            .with_beta_1(0.9)
+            .with_beta_2(0.999)
             .with_epsilon(1e-8)
-            .with_grad_clipping(Some(GradientClippingConfig::Norm(1.0)))
             .init();
         Ok(Self {
+            average: (config.average > 0.0).then(|| net.valid()),
             config,
             run,
             device,
-            pool: Arc::new(pool),
+            pool,
             net,
             optimizer,
             training,
             held_out,
             step: 0,
-            before: None,
+            saved: None,
+            state: State::default(),
         })
     }
 
-    /// The network as it stands.
-    pub fn net(&self) -> &StereoNet {
-        &self.net
+    /// The network that is validated and saved, without gradients: the average where there is one.
+    pub fn net(&self) -> StereoNet {
+        self.average.clone().unwrap_or_else(|| self.net.valid())
     }
 
     /// The configuration.
@@ -240,54 +190,66 @@ impl Trainer {
         &self.config
     }
 
+    /// The run directory.
+    pub fn run_dir(&self) -> &RunDir {
+        &self.run
+    }
+
+    /// What was found on the held-out pairs before the first step, once that is known.
+    pub fn before(&self) -> Option<Scored> {
+        self.state.before
+    }
+
     /// How many steps are done, and how many there are.
     pub fn progress(&self) -> (usize, usize) {
-        let all = self.steps_per_epoch() * self.config.schedule.epochs;
         (
             self.step,
-            all.min(self.config.schedule.steps.unwrap_or(usize::MAX)),
+            self.config.schedule.total(self.steps_per_epoch()),
         )
     }
 
-    /// Held-out pairs before the first step and after the last. Trains in between, telling
-    /// `on_step` of every step.
+    /// Trains to the end of the schedule, or until the observer stops it. Held-out pairs are looked
+    /// at before the first step, after the last, and as often in between as the configuration says.
     ///
     /// # Errors
-    /// When data cannot be read, the run directory not written, or the loss is no number.
-    pub fn run(
-        &mut self,
-        mut on_step: impl FnMut(&LogLine),
-    ) -> Result<(Validation, Validation), TrainError> {
-        let before = match self.before {
-            Some(before) => before,
-            None => self.validate()?,
-        };
-        self.before = Some(before);
+    /// When data cannot be read, the run directory not written, or what is computed is no number.
+    pub fn run(&mut self, observer: &mut dyn Observer) -> Result<Ended, TrainError> {
         let (_, total) = self.progress();
-        let ahead = 2 * self.config.batch;
         while self.step < total {
             let epoch = self.step / self.steps_per_epoch();
-            let order = self.epoch_order(epoch);
-            let rest = order[(self.step % self.steps_per_epoch()) * self.config.batch..].to_vec();
-            let mut read = self.pool.prefetch(rest, ahead);
+            let mut samples = self.samples(epoch);
             while self.step < total && self.step / self.steps_per_epoch() == epoch {
-                let samples: Vec<Sample> = read
+                // A validation comes after the checkpoint of its step: a run that goes on from there
+                // repeats it.
+                if self.validation_is_due() && self.assess(observer)?.is_none() {
+                    return self.stopped();
+                }
+                let waiting = Instant::now();
+                let batch: Vec<Sample> = samples
                     .by_ref()
                     .take(self.config.batch)
                     .collect::<Result<_, _>>()?;
-                if samples.is_empty() {
-                    break;
-                }
-                let line = self.step(&samples, epoch)?;
+                let waited = waiting.elapsed().as_secs_f64();
+                let mut line = self.step(&batch, epoch)?;
+                line.waited = waited;
                 self.run.log(&line)?;
-                on_step(&line);
+                observer.step(&line);
                 if self.step.is_multiple_of(self.config.checkpoint_every) || self.step == total {
-                    self.checkpoint()?;
+                    self.checkpoint(&line.frames)?;
+                }
+                if observer.stop() {
+                    return self.stopped();
                 }
             }
         }
-        let after = self.validate()?;
-        Ok((before, after))
+        let Some(after) = self.assess(observer)? else {
+            return self.stopped();
+        };
+        Ok(Ended::Finished {
+            before: self.state.before.unwrap_or(after),
+            after,
+            best: self.state.best.unwrap_or(after),
+        })
     }
 
     /// One step: crop and augment, predict, compare by warping, follow the gradient.
@@ -320,17 +282,17 @@ impl Trainer {
             (_, false) => total,
         };
         let value = total.clone().into_scalar::<f32>();
-        if !value.is_finite() {
-            return Err(TrainError::NotFinite {
-                step: self.step + 1,
-                loss: value,
-                frames: batch.names,
-            });
-        }
-        let gradients = GradientsParams::from_grads(total.backward(), &self.net);
-        let lr = self.lr(epoch);
+        self.number(self.step + 1, "the loss", value, &batch.names)?;
+        let mut gradients = GradientsParams::from_grads(total.backward(), &self.net);
+        let norm = gradients::clip(&mut gradients, &self.net, self.config.clip);
+        self.number(self.step + 1, "the gradient", norm, &batch.names)?;
+        let lr = self.config.schedule.lr(epoch);
         self.net = self.optimizer.step(lr, self.net.clone(), gradients);
         self.step += 1;
+        if let Some(average) = self.average.take() {
+            let decay = self.config.average;
+            self.average = Some(averaging::follow(average, &self.net, decay, self.step));
+        }
 
         Ok(LogLine {
             step: self.step,
@@ -338,69 +300,143 @@ impl Trainer {
             lr,
             loss: value,
             terms: terms.values(),
+            gradient: norm,
             seconds: started.elapsed().as_secs_f64(),
+            waited: 0.0,
+            frames: batch.names,
         })
     }
 
-    /// The photometric loss over whole held-out pairs.
-    ///
-    /// # Errors
-    /// When a pair cannot be read.
-    pub fn validate(&self) -> Result<Validation, TrainError> {
-        let net = self.net.valid();
+    /// Looks at the held-out pairs, writes down what it found and tells the observer; `None` when that
+    /// stops it on the way.
+    fn assess(&mut self, observer: &mut dyn Observer) -> Result<Option<Scored>, TrainError> {
+        let Some((validation, pairs)) = self.validate(observer)? else {
+            return Ok(None);
+        };
+        let scored = Scored {
+            step: self.step,
+            validation,
+        };
+        if self.step == 0 {
+            self.state.before = Some(scored);
+        }
+        let best = match self.state.best {
+            Some(best) if !validation.is_better_than(&best.validation) => best,
+            _ => scored,
+        };
+        self.state.best = Some(best);
+        self.run.log(&scored)?;
+        observer.validated(&scored, &best, &pairs)?;
+        Ok(Some(scored))
+    }
+
+    /// How the network explains whole held-out pairs, and the first few of them for pictures; `None`
+    /// when the observer stops it on the way.
+    fn validate(
+        &self,
+        observer: &mut dyn Observer,
+    ) -> Result<Option<(Validation, Vec<Explained>)>, TrainError> {
+        let net = self.net();
         let device = self.device.clone().inner();
         let (mut ssim, mut l1, mut census) = (0.0, 0.0, 0.0);
-        for frame in prefetch(self.pool.clone(), self.held_out.clone(), 2) {
-            let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame?, &device);
+        let (mut errors, mut pairs) = (Errors::default(), vec![]);
+        for sample in self.pool.whole(self.held_out.clone()) {
+            let (frame, truth) = sample?;
+            let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame, &device);
             let disparity = net.forward(left.clone(), right.clone()).disparity;
-            let view = View::new(left, right, disparity);
+            let view = View::new(left, right.clone(), disparity.clone());
             let (_, terms) = self.config.loss.self_supervised(&view, None);
             let terms = terms.values();
             ssim += terms.ssim;
             l1 += terms.l1;
             census += terms.census.unwrap_or(0.0);
+            self.number(self.step, "the photometric loss", ssim + l1, &frame.name)?;
+            if let Some(truth) = &truth {
+                let (width, height) = frame.left.dimensions();
+                errors.add(&to_plane(&disparity, width, height), truth);
+            }
+            if pairs.len() < PICTURES {
+                pairs.push(Explained::new(frame, &right, &disparity, truth));
+            }
+            if observer.stop() {
+                return Ok(None);
+            }
         }
         let n = self.held_out.len() as f32;
         let (ssim, l1, census) = (ssim / n, l1 / n, census / n);
         let weights = &self.config.loss;
-        Ok(Validation {
+        let validation = Validation {
             frames: self.held_out.len(),
             photometric: weights.ssim * ssim + weights.l1 * l1 + weights.census * census,
             ssim,
             l1,
             census: (weights.census > 0.0).then_some(census),
+            accuracy: errors.accuracy(),
+        };
+        Ok(Some((validation, pairs)))
+    }
+
+    fn validation_is_due(&self) -> bool {
+        let every = match self.config.validate_every {
+            0 => self.steps_per_epoch(),
+            every => every,
+        };
+        self.step.is_multiple_of(every)
+    }
+
+    /// Refuses a value that is no number, and names the frames behind it.
+    fn number(
+        &self,
+        step: usize,
+        what: &'static str,
+        value: f32,
+        frames: &str,
+    ) -> Result<(), TrainError> {
+        if value.is_finite() {
+            return Ok(());
+        }
+        Err(TrainError::NotFinite {
+            step,
+            what,
+            value,
+            frames: frames.to_owned(),
         })
     }
 
-    fn checkpoint(&self) -> Result<(), TrainError> {
-        self.run.checkpoint(
-            self.step,
-            &self.net,
-            &self.optimizer,
-            &State {
-                before: self.before,
-            },
-        )
+    /// Saves what is needed to go on, unless `frames` (the last batch) spoiled the weights.
+    fn checkpoint(&mut self, frames: &str) -> Result<(), TrainError> {
+        let length = gradients::norm(&self.net);
+        self.number(self.step, "the length of the weights", length, frames)?;
+        let saved = Saved {
+            net: self.net.clone(),
+            average: self.average.clone(),
+            optimizer: self.optimizer.clone(),
+        };
+        self.run
+            .checkpoint(self.step, &saved, &self.net(), &self.state)?;
+        self.saved = Some(self.step);
+        Ok(())
     }
 
-    /// The run directory.
-    pub fn run_dir(&self) -> &RunDir {
-        &self.run
+    fn stopped(&mut self) -> Result<Ended, TrainError> {
+        if self.saved != Some(self.step) {
+            self.checkpoint("the last batch")?;
+        }
+        Ok(Ended::Stopped { step: self.step })
     }
 
     fn steps_per_epoch(&self) -> usize {
         self.training.len().div_ceil(self.config.batch)
     }
 
-    fn lr(&self, epoch: usize) -> f64 {
-        let Schedule { lr, drop_epoch, .. } = self.config.schedule;
-        if epoch < drop_epoch { lr } else { lr / 10.0 }
-    }
-
-    fn epoch_order(&self, epoch: usize) -> Vec<usize> {
+    /// What is left of an epoch, read ahead on threads.
+    fn samples(&self, epoch: usize) -> Prefetch<Sample, TrainError> {
         let mut order = self.training.clone();
         order.shuffle(&mut self.rng(2 * epoch as u64));
-        order
+        let first = (epoch * self.training.len()) as u64;
+        let done = (self.step % self.steps_per_epoch()) * self.config.batch;
+        let order = (first..).zip(order).skip(done).collect();
+        self.pool.training(order, 2 * self.config.batch)
     }
 
     /// A generator that depends on the seed and the place in the schedule only, so that a resumed
@@ -428,7 +464,10 @@ fn split(frames: usize) -> (Vec<usize>, Vec<usize>) {
 
 #[cfg(test)]
 mod tests {
-    use super::split;
+    use super::*;
+    use barchan_datasets::{DataError, Rgb, StereoFrame};
+    use barchan_geometry::RectifiedRig;
+    use barchan_model::Preset;
 
     #[test]
     fn held_out_frames_are_never_trained_on() {
@@ -438,5 +477,69 @@ mod tests {
             assert_eq!(training.len() + held_out.len(), n);
             assert!(!training.is_empty() && (1..=16).contains(&held_out.len()));
         }
+    }
+
+    /// Six pairs of one pattern, one pixel of one of them no number.
+    struct Poisoned {
+        rig: RectifiedRig,
+        frame: usize,
+    }
+
+    impl StereoSource for Poisoned {
+        fn rig(&self) -> &RectifiedRig {
+            &self.rig
+        }
+        fn len(&self) -> usize {
+            6
+        }
+        fn frame(&self, index: usize) -> Result<StereoFrame, DataError> {
+            let mut left = Rgb::from_fn(64, 48, |x, y| {
+                image::Rgb([((x * 37 + y * 11) % 64) as f32 / 64.0; 3])
+            });
+            let right = left.clone();
+            if index == self.frame {
+                left.put_pixel(32, 24, image::Rgb([f32::NAN; 3]));
+            }
+            Ok(StereoFrame {
+                index,
+                name: self.name(index),
+                time: 0.0,
+                left,
+                right,
+            })
+        }
+    }
+
+    fn poisoned(frame: usize, steps: usize) -> Result<Ended, TrainError> {
+        let rig = RectifiedRig {
+            width: 64,
+            height: 48,
+            fx: 50.0,
+            fy: 50.0,
+            cx: 32.0,
+            cy: 24.0,
+            doffs: 0.0,
+            baseline: 0.1,
+        };
+        let mut config = TrainConfig::new(Preset::Tiny.config());
+        config.data = vec!["folder:here".into()];
+        config.net.max_disparity = 16;
+        config.schedule.steps = Some(steps);
+        let dir = tempfile::tempdir().unwrap();
+        let source = Box::new(Poisoned { rig, frame });
+        Trainer::create(dir.path(), config, vec![source], None)
+            .and_then(|mut trainer| trainer.run(&mut ()))
+    }
+
+    #[test]
+    fn a_poisoned_frame_stops_the_run_and_is_named() {
+        // Frame 3 is held out, 2 is trained on, 99 is not there.
+        for (frame, name) in [(2, "000002"), (3, "000003")] {
+            let message = poisoned(frame, 5).unwrap_err().to_string();
+            for word in [name, "folder:here", "NaN", "step", "cure"] {
+                assert!(message.contains(word), "\"{word}\" is not in: {message}");
+            }
+        }
+        assert!(matches!(poisoned(99, 2), Ok(Ended::Finished { .. })));
     }
 }
