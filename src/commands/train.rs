@@ -415,7 +415,10 @@ fn configure(args: &Settings, augmentation: &AugmentationArgs) -> Result<TrainCo
     if args.finetune {
         config.schedule = Schedule::FINETUNE;
         config.crop = TrainConfig::FINETUNE_CROP;
-        config.init = Some("tiny".to_owned());
+        let shipped = match args.preset {
+            None | Some(PresetArg::Tiny) => "tiny",
+        };
+        config.init = Some(shipped.to_owned());
     }
     if args.supervised {
         config.supervised = true;
