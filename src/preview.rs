@@ -69,7 +69,7 @@ pub fn contact_sheet(pairs: &[(StereoFrame, Option<Plane>)]) -> RgbImage {
 
 /// What a network makes of pairs, a pair a row: the left image, its disparity, the right image warped
 /// by it (which should look like the left), and in red what is wrong: the error where the truth is
-/// known, full red at [`FULL_ERROR`], else how far the warped image is from the left one.
+/// known, full red at five pixels, else how far the warped image is from the left one.
 pub fn explained_sheet(pairs: &[Explained]) -> RgbImage {
     let rows: Vec<[RgbImage; 4]> = pairs
         .iter()
