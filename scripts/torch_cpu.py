@@ -7,6 +7,7 @@ stub takes its place that only has the names which PyTorch's Python bindings loo
 `torch.cuda.is_available()` is False; what asks for CUDA all the same ends the process.
 """
 
+import ctypes
 import subprocess
 import sys
 import sysconfig
@@ -25,8 +26,6 @@ LEFT_OUT = ("torch/include/", "torch/share/", "torch/bin/protoc")
 LEFT_OUT_LIBRARIES = ["libtorch_cuda.so", "libtorch_cuda_linalg.so", "libtorch_nvshmem.so"]
 # What the bindings link besides libtorch_cuda.so, and these wheels do not hold.
 EMPTY = ["libcudnn.so.9", "libcusparseLt.so.0", "libcufile.so.0"]
-# These come with every system, and Python itself.
-ELSEWHERE = ("GLIBC", "GCC", "CXXABI", "libcudart")
 # Called when the bindings are loaded: a reference to a null function pointer.
 GIL_CHECKER = "_ZN4c10d15get_gil_checkerEv"
 
@@ -77,13 +76,11 @@ def unpack(work: Path, version: str) -> None:
 
 def link_stubs(lib: Path) -> None:
     """libtorch_cuda.so with every name that the bindings want and nobody else has, the others empty."""
-    missing = {
-        name
-        for name, source in symbols(lib / "libtorch_python.so", "--undefined-only", "U")
-        if not source.startswith(ELSEWHERE) and not name.startswith(("Py", "_Py"))
-    }
+    missing = symbols(lib / "libtorch_python.so", "--undefined-only", "U")
     for path in lib.glob("*.so*"):
-        missing -= {name for name, _ in symbols(path, "--defined-only")}
+        missing -= symbols(path, "--defined-only")
+    for system in (ctypes.CDLL(None), ctypes.CDLL("libstdc++.so.6")):  # the first is Python
+        missing = {name for name in missing if not hasattr(system, name)}
     functions = sorted(name for name in missing if not name.startswith("_ZT"))
     lines = [".text"]
     lines += [f".globl {name}\n{name}:" for name in functions if name != GIL_CHECKER]
@@ -107,14 +104,14 @@ def link_stubs(lib: Path) -> None:
     source.unlink()
 
 
-def symbols(path: Path, which: str, kind: str = "") -> list:
-    """Dynamic symbols of a library, and where each says it comes from."""
+def symbols(path: Path, which: str, kind: str = "") -> set:
+    """Names of dynamic symbols of a library; `kind` is the letter that nm gives them."""
     try:
         result = subprocess.run(["nm", "-D", which, str(path)], capture_output=True, text=True)
     except FileNotFoundError:
         sys.exit("nm not found: the binutils that come with gcc are needed")
     found = [line.split()[-2:] for line in result.stdout.splitlines()]
-    return [tuple(name.partition("@")[::2]) for letter, name in found if letter.startswith(kind)]
+    return {name.split("@")[0] for letter, name in found if letter.startswith(kind)}
 
 
 if __name__ == "__main__":
