@@ -1,18 +1,20 @@
 """The network against a definition in pure PyTorch. `make peers-torch` runs this.
 
 Weights go both ways between barchan and PyTorch; disparity, standard deviation, confidence, losses and
-gradients of all presets must agree. At the end the time of a training step in both, side by side. Exits 1
+gradients of all presets must agree. At the end the time of a training step in both, side by side; on a machine
+with other work set OMP_WAIT_POLICY=passive, or PyTorch's threads wait for one another at full load. Exits 1
 when a figure is out of bounds or a check fails to run.
 """
 
 import argparse
 import json
 import os
+import resource
 import shutil
 import sys
 import traceback
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 
 import cv2
 import numpy as np
@@ -25,7 +27,6 @@ from torch_training import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 PRESETS = ["tiny", "rover", "paper"]
-THREADS = 2
 SIZES = [(320, 192), (253, 121), (129, 97), (97, 65), (49, 33)]
 """Whole, no multiples of anything, and narrower than the search."""
 PLAIN = ["--noise", 0, "--brightness", 0, "--contrast", 0, "--channel", 0, "--add-disparity", 0, "--no-check"]
@@ -128,31 +129,52 @@ def check_training(
     table.at_most(f"{label}: gradients of the other sign, mean", float(np.mean(list(wrong.values()))), 1e-3)
 
 
-def time_steps(barchan: Barchan, weights: Path, data: Path, device: str, rounds: int, work: Path) -> None:
-    """Seconds of a self-supervised training step, both programs taking turns, the first step of each turn left out."""
+def time_steps(
+    barchan: Barchan, weights: Path, data: Path, device: str, threads: int, rounds: int, work: Path
+) -> None:
+    """Seconds of a self-supervised training step, both programs taking turns, the first step of each turn left
+    out. CPU seconds, of all threads together, still compare the two when the machine has other work."""
     steps = 6
     ((_, pair),) = pairs(data).items()
     width, height = image_size(data)
     net, _ = torch_network.load(weights)
     trainer = Trainer(net, 1e-3)
-    ours, theirs = [], []
-    for turn in range(rounds):
-        out = work / f"time-{height}x{width}-{device}-{turn}"
+
+    def train(steps: int) -> tuple:
+        """Seconds of each step, and CPU seconds of the whole program."""
+        out = work / f"time-{height}x{width}"
+        shutil.rmtree(out, ignore_errors=True)
         options = ["--init", weights, "--crop", height, width, "--epochs", steps, "--device", device, *PLAIN]
+        before = children_cpu()
         barchan("train", "--data", f"folder:{data}", *options, "--out", out)
         log = (out / "log.jsonl").read_text().splitlines()
-        ours += [json.loads(line)["seconds"] for line in log[1:]]
+        return [json.loads(line)["seconds"] for line in log], children_cpu() - before
+
+    ours, theirs, our_cpu, their_cpu = [], [], [], []
+    for _ in range(rounds):
+        _, start = train(1)
+        seconds, all_steps = train(steps)
+        ours += seconds[1:]
+        our_cpu.append((all_steps - start) / (steps - 1))
         for step in range(steps):
-            started = perf_counter()
+            started, cpu = perf_counter(), process_time()
             trainer.step(*pair)
             if step > 0:
                 theirs.append(perf_counter() - started)
-    a, b = np.median(ours), np.median(theirs)
-    print(
-        f"  rover, one training step {height}x{width} (height x width), {THREADS} threads: barchan {device} "
-        f"{a:.3f} s (least {min(ours):.3f}), PyTorch {b:.3f} s (least {min(theirs):.3f}), medians {a / b:.2f} times",
-        flush=True,
-    )
+                their_cpu.append(process_time() - cpu)
+    print(f"  rover, a training step {height}x{width} (height x width), barchan {device} and PyTorch, {threads} threads:")
+    for what, a, b in (
+        ("seconds, median", np.median(ours), np.median(theirs)),
+        ("seconds, least", min(ours), min(theirs)),
+        ("CPU seconds, median", np.median(our_cpu), np.median(their_cpu)),
+    ):
+        print(f"    {what:<20} {a:8.3f} {b:8.3f}   {a / b:.2f} times", flush=True)
+
+
+def children_cpu() -> float:
+    """CPU seconds of the programs run so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
@@ -161,11 +183,12 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=ROOT / "runs" / "peers-torch", help="folder for what is made")
     parser.add_argument("--device", default="flex", help="barchan's device whose training step is timed")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each program in the timing; 0 leaves it out")
+    parser.add_argument("--threads", type=int, default=2, help="of both programs")
     parser.add_argument("--timing-only", action="store_true", help="no checks")
     options = parser.parse_args()
     barchan, work = Barchan(options.barchan), options.work
-    torch.set_num_threads(THREADS)
-    os.environ["RAYON_NUM_THREADS"] = str(THREADS)
+    torch.set_num_threads(options.threads)
+    os.environ["RAYON_NUM_THREADS"] = str(options.threads)
 
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -202,7 +225,8 @@ def main() -> None:
 
     def timing(table: Table) -> None:
         for width, height in ((256, 128), (384, 320)):
-            time_steps(barchan, weights["rover"], rendered(width, height, 1), options.device, options.rounds, work)
+            data = rendered(width, height, 1)
+            time_steps(barchan, weights["rover"], data, options.device, options.threads, options.rounds, work)
 
     table = Table()
     parts = [prepare, timing] if options.timing_only else [prepare, outputs, training, timing]
