@@ -23,9 +23,11 @@ DATA = synth:seed=1,frames=40
 OUT  = runs/demo
 
 PEERS := $(CACHE)/peers-$(shell sha256sum tests/peers/requirements.txt | cut -c 1-12)
+TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/libtorch.py
+PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch peers onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch peers peers-torch onnxruntime libtorch sample-data clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -67,6 +69,15 @@ peers: build onnxruntime $(PEERS)/ready ## outputs against other people's progra
 $(PEERS)/ready: tests/peers/requirements.txt
 	$(PYTHON) -m venv --clear $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --no-deps --only-binary :all: --requirement $<
+	touch $@
+
+peers-torch: build onnxruntime $(PEERS_TORCH)/ready ## the network in pure PyTorch: weights both ways, gradients, time of a step (1 GB to fetch)
+	$(PEERS_TORCH)/bin/python tests/peers/run_torch.py --barchan "$(BARCHAN)"
+
+$(PEERS_TORCH)/ready: $(TORCH_PINS)
+	$(PYTHON) -m venv --clear $(PEERS_TORCH)
+	$(PEERS_TORCH)/bin/python -m pip install --quiet --no-deps --only-binary :all: --requirement $<
+	$(PEERS_TORCH)/bin/python scripts/torch_cpu.py
 	touch $@
 
 onnxruntime: ## ONNX Runtime's library into the cache, where barchan looks for it

@@ -27,7 +27,7 @@ pub(crate) fn conv1x1(channels: [usize; 2], device: &Device) -> Conv2d {
 /// Down to 1/16 and back up to 1/4 with shortcuts (Lin 2017): a receptive field of about 120 pixels.
 #[derive(Module, Debug)]
 pub struct Features {
-    half: Conv2d,
+    stem: Conv2d,
     quarter: Conv2d,
     quarter_more: Conv2d,
     eighth: Conv2d,
@@ -50,7 +50,7 @@ impl Features {
     /// `channels` at 1/2, 1/4, 1/8 and 1/16.
     pub fn init([half, quarter, eighth, sixteenth]: [usize; 4], device: &Device) -> Self {
         Self {
-            half: conv3x3([3, half], 2, device),
+            stem: conv3x3([3, half], 2, device),
             quarter: conv3x3([half, quarter], 2, device),
             quarter_more: conv3x3([quarter, quarter], 1, device),
             eighth: conv3x3([quarter, eighth], 2, device),
@@ -68,7 +68,7 @@ impl Features {
             let y = ops.conv2d(&format!("features.{name}"), conv, x);
             ops.relu(&y)
         };
-        let half = layer(ops, "half", &self.half, image);
+        let half = layer(ops, "stem", &self.stem, image);
         let quarter = layer(ops, "quarter", &self.quarter, &half);
         let quarter = layer(ops, "quarter_more", &self.quarter_more, &quarter);
         let eighth = layer(ops, "eighth", &self.eighth, &quarter);

@@ -1,10 +1,10 @@
 use barchan_datasets::{StereoSource, Synth};
-use barchan_model::{NetConfig, Preset};
+use barchan_model::Preset;
 use burn::tensor::Tensor;
 
 use super::checks::{between_pixels, device, gradient_error, map, waves};
 use super::*;
-use crate::{Augmentation, DeviceName, LogLine, Schedule, TrainConfig, Trainer, Validation};
+use crate::{Augmentation, Ended, LogLine, Observer, TrainConfig, Trainer, Validation};
 
 type Change = fn(&mut Loss);
 
@@ -318,39 +318,40 @@ fn loss_with(change: Change) -> Loss {
     loss
 }
 
+/// What a run tells of its steps.
+#[derive(Default)]
+struct Lines(Vec<LogLine>);
+
+impl Observer for Lines {
+    fn step(&mut self, line: &LogLine) {
+        self.0.push(line.clone());
+    }
+}
+
 /// Trains a random network on one frame, uncropped and untouched, so that steps compare.
 fn train(change: Change) -> (Vec<LogLine>, [Validation; 2]) {
     let data = "seed=5,frames=2,width=64,height=48".to_owned();
     let dir = tempfile::tempdir().unwrap();
-    let config = TrainConfig {
-        data: vec![format!("synth:{data}")],
-        init: None,
-        device: DeviceName::Flex,
-        seed: 1,
-        supervised: false,
-        batch: 1,
-        crop: [48, 64],
-        checkpoint_every: 100,
-        net: NetConfig {
-            max_disparity: 32,
-            ..Preset::Tiny.config()
-        },
-        schedule: Schedule {
-            epochs: 8,
-            ..Schedule::PRETRAIN
-        },
-        loss: loss_with(change),
-        augmentation: Augmentation {
-            noise: 0.0,
-            brightness: 0.0,
-            contrast: 0.0,
-            channel: 0.0,
-            disparity: 0,
-        },
+    let mut config = TrainConfig::new(Preset::Tiny.config());
+    config.data = vec![format!("synth:{data}")];
+    config.crop = [48, 64];
+    config.net.max_disparity = 32;
+    config.schedule.epochs = 8;
+    config.loss = loss_with(change);
+    config.augmentation = Augmentation {
+        noise: 0.0,
+        brightness: 0.0,
+        contrast: 0.0,
+        channel: 0.0,
+        ..Augmentation::default()
     };
     let source: Box<dyn StereoSource> = Box::new(Synth::parse(&data).unwrap());
     let mut trainer = Trainer::create(&dir.path().join("run"), config, vec![source], None).unwrap();
-    let mut lines = vec![];
-    let (before, after) = trainer.run(|line| lines.push(line.clone())).unwrap();
-    (lines, [before, after])
+    let mut lines = Lines::default();
+    match trainer.run(&mut lines).unwrap() {
+        Ended::Finished { before, after, .. } => {
+            (lines.0, [before, after].map(|scored| scored.validation))
+        }
+        Ended::Stopped { step } => panic!("stopped after {step}"),
+    }
 }
