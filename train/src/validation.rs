@@ -62,7 +62,7 @@ pub struct Explained {
     pub frame: StereoFrame,
     /// The disparity of its left image, pixels.
     pub disparity: Plane,
-    /// The right image seen from the left camera through that disparity; black where it shows nothing.
+    /// The right image seen from the left camera through that disparity; NaN where it shows nothing.
     pub warped: Rgb,
     /// The true disparity, NaN where not known; where the data has any.
     pub truth: Option<Plane>,
@@ -77,14 +77,18 @@ impl Explained {
         truth: Option<Plane>,
     ) -> Self {
         let (warped, inside) = loss::warp_right_to_left(right, disparity);
-        let warped: Vec<f32> = (warped * inside).to_data().iter().collect();
+        let [warped, inside]: [Vec<f32>; 2] =
+            [warped, inside].map(|t| t.to_data().iter().collect());
         let (width, height) = frame.left.dimensions();
         let plane = (width * height) as usize;
         Self {
             disparity: to_plane(disparity, width, height),
             warped: Rgb::from_fn(width, height, |x, y| {
                 let at = (y * width + x) as usize;
-                image::Rgb(std::array::from_fn(|c| warped[c * plane + at]))
+                image::Rgb(match inside[at] > 0.0 {
+                    true => std::array::from_fn(|c| warped[c * plane + at]),
+                    false => [f32::NAN; 3],
+                })
             }),
             frame,
             truth,
