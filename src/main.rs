@@ -37,7 +37,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    Train(commands::train::Args),
+    Train(Box<commands::train::Args>),
     Export(commands::export::Args),
     Probe(commands::probe::Args),
     Infer(commands::infer::Args),
@@ -54,7 +54,7 @@ fn main() -> ExitCode {
     let output = output::Output { json: cli.json };
     let runtime = cli.onnxruntime.as_deref();
     let result = match cli.command {
-        Command::Train(args) => match commands::train::run(args, &output) {
+        Command::Train(args) => match commands::train::run(*args, &output) {
             Ok(false) => return ExitCode::from(commands::train::INTERRUPTED),
             other => other.map(|_| ()),
         },

@@ -52,6 +52,7 @@ impl Observer for () {}
 
 /// How a run came to its end.
 #[derive(Clone, Copy, Debug)]
+#[allow(clippy::large_enum_variant)] // There is one of it in a run.
 pub enum Ended {
     /// All steps are made.
     Finished {
