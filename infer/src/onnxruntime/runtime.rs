@@ -115,9 +115,6 @@ pub(crate) fn open(runtime: &Runtime, path: &Path, threads: usize) -> Result<Ses
         .map_err(|e| failed(e.to_string()))?
         .with_intra_threads(threads)
         .map_err(|e| failed(e.to_string()))?
-        // Without it int8 can overflow on x86 processors that lack VNNI.
-        .with_config_entry("session.x64quantprecision", "1")
-        .map_err(|e| failed(e.to_string()))?
         // What fails is returned; the runtime need not print it too.
         .with_log_level(LogLevel::Fatal)
         .map_err(|e| failed(e.to_string()))?

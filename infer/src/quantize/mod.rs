@@ -8,10 +8,11 @@
 //! What is rounded is what ONNX Runtime runs faster for it on a CPU: convolutions, 2-D and 3-D, of
 //! enough channels. Small ones stay float, and transposed convolutions and matrix products, of which
 //! it has no faster int8 kernel (ratios of 1.04 and 1.1). Fixed kernels (sums, expectations,
-//! differences), told by their repeated values, stay float too: disparity depends on their precision.
+//! differences), told by their few different values, stay float too: disparity depends on their precision.
 //!
 //! Processors of x86-64 without VNNI add products of uint8 and int8 in 16 bits that overflow at large
-//! weights; ONNX Runtime works around it with the session entry `session.x64quantprecision = 1`.
+//! weights. ONNX Runtime's remedy, the session entry `session.x64quantprecision`, fails in 1.31 where convolutions
+//! share weights, so there int8 is at its user's risk.
 
 mod calibrate;
 mod plan;

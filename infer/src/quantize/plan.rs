@@ -166,7 +166,7 @@ fn worth(
     let mut sorted: Vec<u32> = values.iter().map(|v| v.to_bits()).collect();
     sorted.sort_unstable();
     sorted.dedup();
-    if 2 * sorted.len() < values.len() {
+    if sorted.len() < LEARNED_VALUES {
         return Ok(Some("a fixed kernel".into()));
     }
     let (outputs, inputs) = (weights.dims[0] as usize, weights.dims[1] as usize);
@@ -179,6 +179,10 @@ fn worth(
             .then(|| "too few channels to gain".into()),
     )
 }
+
+/// A kernel of fewer different values was not learned. Learned ones repeat theirs too: a band of zeros around
+/// a mix over disparity, copies for the groups of a convolution that all bins share.
+const LEARNED_VALUES: usize = 16;
 
 /// Operators that rearrange values and change none.
 fn moves_values(node: &Node) -> bool {
