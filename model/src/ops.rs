@@ -2,8 +2,10 @@
 
 use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
 use burn::tensor::activation::{relu, sigmoid};
-use burn::tensor::module::{avg_pool2d, conv2d};
-use burn::tensor::ops::{AvgPoolOptions, ConvOptions, PadMode};
+use burn::tensor::module::{avg_pool2d, conv2d, interpolate};
+use burn::tensor::ops::{
+    AvgPoolOptions, ConvOptions, InterpolateMode, InterpolateOptions, PadMode,
+};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::planar::DisparityMix;
@@ -143,6 +145,17 @@ pub trait Ops {
     fn channel_max(&mut self, x: &Self::Map) -> Self::Map;
     /// The number of the largest channel at every pixel.
     fn channel_argmax(&mut self, x: &Self::Map) -> Self::Map;
+    /// The sum of every 3x3 neighbour (row by row, the border repeated) of a map of one channel, times its
+    /// weights: channel `n * shares + s` of `weights` is that of neighbour `n` in share `s`. `shares` channels.
+    fn mix_neighbours(
+        &mut self,
+        name: &str,
+        shares: usize,
+        weights: &Self::Map,
+        x: &Self::Map,
+    ) -> Self::Map;
+    /// What [`Ops::mix_neighbours`] makes of ones.
+    fn sum_neighbours(&mut self, name: &str, shares: usize, weights: &Self::Map) -> Self::Map;
     /// One constant a channel, `[1, n, 1, 1]`.
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> Self::Map;
     /// `a + b`.
@@ -177,6 +190,9 @@ pub trait Ops {
     /// Every `r * r` channels to one of `r` times the height and width.
     fn depth_to_space(&mut self, r: usize, x: &Self::Map) -> Self::Map;
 }
+
+/// Pixels of a 3x3 neighbourhood.
+pub(crate) const NEIGHBOURS: usize = 9;
 
 /// Executes at once, with Burn.
 pub struct Execute {
@@ -318,6 +334,35 @@ impl Ops for Execute {
     fn channel_argmax(&mut self, x: &Tensor<4>) -> Tensor<4> {
         x.clone().detach().argmax(1).float()
     }
+    fn mix_neighbours(
+        &mut self,
+        _: &str,
+        shares: usize,
+        weights: &Tensor<4>,
+        x: &Tensor<4>,
+    ) -> Tensor<4> {
+        let [batch, _, height, width] = x.dims();
+        let padded = x.clone().pad((1, 1, 1, 1), PadMode::Edge);
+        let around = (0..NEIGHBOURS)
+            .map(|n| {
+                let row = padded.clone().narrow(2, n / 3, height);
+                row.narrow(3, n % 3, width)
+            })
+            .collect();
+        let around = Tensor::cat(around, 1).reshape([batch, NEIGHBOURS, 1, height, width]);
+        let weights = weights
+            .clone()
+            .reshape([batch, NEIGHBOURS, shares, height, width]);
+        (weights * around).sum_dim(1).squeeze_dim(1)
+    }
+    fn sum_neighbours(&mut self, _: &str, shares: usize, weights: &Tensor<4>) -> Tensor<4> {
+        let [batch, _, height, width] = weights.dims();
+        weights
+            .clone()
+            .reshape([batch, NEIGHBOURS, shares, height, width])
+            .sum_dim(1)
+            .squeeze_dim(1)
+    }
     fn channel_constant(&mut self, _: &str, values: &[f32]) -> Tensor<4> {
         Tensor::from_data(
             TensorData::new(values.to_vec(), [1, values.len(), 1, 1]),
@@ -386,11 +431,8 @@ impl Ops for Execute {
         x.clone().narrow(2, 0, height).narrow(3, 0, width)
     }
     fn double(&mut self, x: &Tensor<4>) -> Tensor<4> {
-        let [batch, channels, height, width] = x.dims();
-        x.clone()
-            .reshape([batch, channels, height, 1, width, 1])
-            .expand([batch, channels, height, 2, width, 2])
-            .reshape([batch, channels, 2 * height, 2 * width])
+        let nearest = InterpolateOptions::new(InterpolateMode::Nearest);
+        interpolate(x.clone(), nearest.with_scale_factor([2.0; 2]))
     }
     fn depth_to_space(&mut self, r: usize, x: &Tensor<4>) -> Tensor<4> {
         let [batch, channels, height, width] = x.dims();

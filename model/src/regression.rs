@@ -5,12 +5,12 @@ use burn::nn::conv::Conv2d;
 use burn::tensor::Device;
 
 use crate::features::{conv1x1, conv3x3};
+use crate::ops::NEIGHBOURS;
 use crate::{Kernel, Ops, Prediction};
 
 /// The volume stands at this fraction of the resolution, so a bin is this many pixels.
 pub const SCALE: usize = 4;
 
-const NEIGHBOURS: usize = 9;
 const SUBPIXELS: usize = SCALE * SCALE;
 
 /// Which bins the mean is taken over.
@@ -61,20 +61,10 @@ impl Regression {
         // Positive weights over their sum. Far below zero a sigmoid is an exponential, so this chooses as a
         // softmax does; it joins the convolution before it, and its sum is a convolution too.
         let weights = ops.sigmoid(&mix);
-        let sum = Kernel::from_fn([SUBPIXELS, NEIGHBOURS * SUBPIXELS, 1, 1], |s, c, _, _| {
-            f32::from(c % SUBPIXELS == s)
-        });
-        let total = ops.fixed_conv2d("regression.weights", &sum, 1, &weights);
+        let total = ops.sum_neighbours("regression.weights", SUBPIXELS, &weights);
         let total = ops.affine(1.0, 1e-12, &total);
-        let neighbours = Kernel::from_fn([NEIGHBOURS * SUBPIXELS, 1, 3, 3], |c, _, y, x| {
-            f32::from(c / SUBPIXELS == 3 * y + x)
-        });
         let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
-            let padded = ops.pad_edge([1; 4], x);
-            let name = |what: &str| format!("regression.{name}.{what}");
-            let around = ops.fixed_conv2d(&name("around"), &neighbours, 1, &padded);
-            let weighted = ops.mul(&weights, &around);
-            let mixed = ops.fixed_conv2d(&name("mix"), &sum, 1, &weighted);
+            let mixed = ops.mix_neighbours(&format!("regression.{name}"), SUBPIXELS, &weights, x);
             let mixed = ops.div(&mixed, &total);
             ops.depth_to_space(SCALE, &mixed)
         };

@@ -109,8 +109,14 @@ pub(crate) fn open(runtime: &Runtime, path: &Path, threads: usize) -> Result<Ses
         )));
     }
     let bytes = Bytes::from(std::fs::read(path).map_err(|e| wrong(e.to_string()))?);
-    inspect::check(bytes.clone()).map_err(wrong)?;
-    let failed = |message: String| wrong(format!("ONNX Runtime does not take it: {message}"));
+    let with_cure = |message: String| match message.contains("cure:") {
+        true => wrong(message),
+        false => wrong(format!(
+            "{message}\n  cure: `barchan export RUN --out x.onnx` writes a file that runs; fetch somebody else's again"
+        )),
+    };
+    inspect::check(bytes.clone()).map_err(with_cure)?;
+    let failed = |message: String| with_cure(format!("ONNX Runtime does not take it: {message}"));
     Session::builder(&runtime.environment)
         .map_err(|e| failed(e.to_string()))?
         .with_intra_threads(threads)

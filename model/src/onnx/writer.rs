@@ -7,6 +7,7 @@ use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
 use burn::nn::{PaddingConfig2d, PaddingConfig3d};
 use burn::tensor::Tensor;
 
+use crate::ops::NEIGHBOURS;
 use crate::planar::DisparityMix;
 use crate::{Correlated, Kernel, Ops};
 
@@ -355,6 +356,28 @@ impl Ops for GraphWriter {
             .plain("ArgMax", &[x], vec![Attribute::int("axis", 1)]);
         let to = vec![Attribute::int("to", FLOAT.into())];
         self.graph.plain("Cast", &[&largest], to)
+    }
+    /// Convolutions with fixed kernels: they run in the layout of those before and after.
+    fn mix_neighbours(
+        &mut self,
+        name: &str,
+        shares: usize,
+        weights: &String,
+        x: &String,
+    ) -> String {
+        let around = Kernel::from_fn([NEIGHBOURS * shares, 1, 3, 3], |c, _, row, column| {
+            f32::from(c / shares == 3 * row + column)
+        });
+        let padded = self.pad_edge([1; 4], x);
+        let around = self.fixed_conv2d(&format!("{name}.around"), &around, 1, &padded);
+        let weighted = self.mul(weights, &around);
+        self.sum_neighbours(&format!("{name}.mix"), shares, &weighted)
+    }
+    fn sum_neighbours(&mut self, name: &str, shares: usize, weights: &String) -> String {
+        let sum = Kernel::from_fn([shares, NEIGHBOURS * shares, 1, 1], |s, c, _, _| {
+            f32::from(c % shares == s)
+        });
+        self.fixed_conv2d(name, &sum, 1, weights)
     }
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> String {
         self.graph
