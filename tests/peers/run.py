@@ -15,6 +15,7 @@ import files
 import matching
 import network
 import rasters
+import speed
 import trajectory
 from common import Barchan, Table
 
@@ -71,8 +72,11 @@ def main() -> None:
         files.check_cloud(table, work / "slam" / "map.ply")
         files.check_cloud(table, work / "map" / "cloud.ply")
 
+    def timings(table: Table) -> None:
+        speed.report(barchan, work)
+
     table = Table()
-    for part in (prepare, exported, engines, matchers, trajectories, terrain, formats):
+    for part in (prepare, exported, engines, matchers, trajectories, terrain, formats, timings):
         try:
             part(table)
         except Exception as error:  # One part that cannot run must not hide the others' figures.
