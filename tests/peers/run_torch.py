@@ -33,6 +33,12 @@ PLAIN = ["--noise", 0, "--brightness", 0, "--contrast", 0, "--channel", 0, "--ad
 """Options of `barchan train` that leave the images as they are."""
 
 
+def steps_of(run: Path) -> list:
+    """The steps of a run's log, without its looks at held-out pairs."""
+    lines = (run / "log.jsonl").read_text().splitlines()
+    return [line for line in map(json.loads, lines) if "loss" in line]
+
+
 def pairs(folder: Path) -> dict:
     """Left and right images [1, 3, H, W] of a `folder` data set, by name."""
     return {
@@ -108,7 +114,7 @@ def check_training(
         barchan("train", *common, "--epochs", steps, "--steps", steps, "--out", out)
         return out
 
-    log = [json.loads(line) for line in (ours(steps) / "log.jsonl").read_text().splitlines()]
+    log = steps_of(ours(steps))
     first = max(abs(log[0][term] - value) / abs(value) for term, value in losses[0].items())
     table.at_most(f"{label}: losses of the first step, relative", first, 1e-4)
     later = max(abs(a["loss"] - b["loss"]) / abs(b["loss"]) for a, b in zip(log, losses, strict=True))
@@ -146,8 +152,7 @@ def time_steps(
         options = ["--init", weights, "--crop", height, width, "--epochs", steps, "--device", device, *PLAIN]
         before = children_cpu()
         barchan("train", "--data", f"folder:{data}", *options, "--out", out)
-        log = (out / "log.jsonl").read_text().splitlines()
-        return [json.loads(line)["seconds"] for line in log], children_cpu() - before
+        return [step["seconds"] for step in steps_of(out)], children_cpu() - before
 
     ours, theirs, our_cpu, their_cpu = [], [], [], []
     for _ in range(rounds):
