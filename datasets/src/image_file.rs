@@ -61,7 +61,10 @@ fn jpeg_is_complete(bytes: &[u8]) -> bool {
 }
 
 /// Writes `bytes` whole or not at all: under another name first, then renamed.
-pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+///
+/// # Errors
+/// When either step fails; nothing is left then.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
     let partial = Path::new(&partial);

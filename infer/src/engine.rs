@@ -114,6 +114,9 @@ pub enum InferError {
         /// What is wrong and what to do.
         message: String,
     },
+    /// A file beside the model could not be written.
+    #[error(transparent)]
+    Data(#[from] barchan_datasets::DataError),
     /// The engine cannot be had on this machine.
     #[error("{0}")]
     Unavailable(String),

@@ -78,8 +78,16 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let bar = output.progress("infer", frames.len());
     let (mut milliseconds, mut density, mut colours) = (vec![], 0.0, None);
     let mut clouds = false;
+    let several = frames.len() > 1;
     for frame in frames {
         let (frame, rig) = frame?;
+        if several && milliseconds.is_empty() {
+            // The times are those of a stream: what is done once is not counted.
+            let (width, height) = frame.left.dimensions();
+            engine
+                .warm_up(width, height)
+                .with_context(|| format!("frame {}", frame.name))?;
+        }
         let started = Instant::now();
         let mut map = engine
             .disparity(&frame.left, &frame.right)

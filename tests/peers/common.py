@@ -4,7 +4,9 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
+import traceback
 from pathlib import Path
 
 import cv2
@@ -41,6 +43,17 @@ class Table:
         self.rows += 1
         self.bad += not good
         print(f"{name:<64} {figure:>12}   {bound:<10} {'ok' if good else 'NOT OK'}", flush=True)
+
+    def run(self, parts: list) -> None:
+        """Runs the parts of a check, prints the sum, and ends the program: with 1 where a figure is bad."""
+        for part in parts:
+            try:
+                part(self)
+            except Exception as error:  # One part that cannot run must not hide the others' figures.
+                traceback.print_exc()
+                self.line(f"{part.__name__} could not run", type(error).__name__, "", False)
+        print(f"{self.rows - self.bad} passed, {self.bad} failed")
+        sys.exit(1 if self.bad else 0)
 
     def at_most(self, name: str, figure: float, bound: float) -> None:
         # Written so that a figure that is not a number is not good.

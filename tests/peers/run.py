@@ -7,8 +7,6 @@ join where ../shared/data has them. Exits 1 when a figure is out of bounds or a 
 
 import argparse
 import shutil
-import sys
-import traceback
 from pathlib import Path
 
 import files
@@ -75,15 +73,7 @@ def main() -> None:
     def timings(table: Table) -> None:
         speed.report(barchan, work)
 
-    table = Table()
-    for part in (prepare, exported, engines, matchers, trajectories, terrain, formats, timings):
-        try:
-            part(table)
-        except Exception as error:  # One part that cannot run must not hide the others' figures.
-            traceback.print_exc()
-            table.line(f"{part.__name__} could not run", type(error).__name__, "", False)
-    print(f"{table.rows - table.bad} passed, {table.bad} failed")
-    sys.exit(1 if table.bad else 0)
+    Table().run([prepare, exported, engines, matchers, trajectories, terrain, formats, timings])
 
 
 if __name__ == "__main__":

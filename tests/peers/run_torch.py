@@ -11,8 +11,6 @@ import json
 import os
 import resource
 import shutil
-import sys
-import traceback
 from pathlib import Path
 from time import perf_counter, process_time
 
@@ -232,16 +230,8 @@ def main() -> None:
             data = rendered(width, height, 1)
             time_steps(barchan, weights["rover"], data, options.device, options.threads, options.rounds, work)
 
-    table = Table()
     parts = [prepare, timing] if options.timing_only else [prepare, outputs, training, timing]
-    for part in parts if options.rounds else parts[:-1]:
-        try:
-            part(table)
-        except Exception as error:  # One part that cannot run must not hide the others' figures.
-            traceback.print_exc()
-            table.line(f"{part.__name__} could not run", type(error).__name__, "", False)
-    print(f"{table.rows - table.bad} passed, {table.bad} failed")
-    sys.exit(1 if table.bad else 0)
+    Table().run(parts if options.rounds else parts[:-1])
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 use std::path::{Path, PathBuf};
 
+use barchan_datasets::write_whole;
 use serde::{Deserialize, Serialize};
 
 use crate::InferError;
@@ -267,13 +268,7 @@ impl Contract {
         }
         text.push('\n');
         text += &toml::to_string(self).map_err(|e| wrong(e.to_string()))?;
-        let part = path.with_extension("toml.part");
-        let written = std::fs::write(&part, text).and_then(|()| std::fs::rename(&part, path));
-        written.map_err(|e| {
-            // Nothing may be there to remove.
-            let _ = std::fs::remove_file(&part);
-            wrong(format!("cannot be written: {e}"))
-        })
+        Ok(write_whole(path, text.as_bytes())?)
     }
 
     /// Whether the numbers make sense.
