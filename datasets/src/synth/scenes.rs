@@ -1,3 +1,5 @@
+use std::f64::consts::FRAC_PI_2;
+
 use barchan_geometry::{RectifiedRig, Se3};
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 use rand::RngExt;
@@ -18,8 +20,8 @@ use crate::pairs::no_frame;
 use crate::{DataError, Plane, Rgb, StereoFrame, StereoSource};
 
 /// Random scenes with exact disparity of both views, for pretraining: floating and standing shapes,
-/// flat, round, angular and thin, before a slanted wall over a slanted floor. Every frame is another
-/// scene; cameras and truth are those of a rectified rig.
+/// flat, round, angular, thin, with holes and in rows and twigs, before slanted walls over a slanted
+/// floor. Every frame is another scene; cameras and truth are those of a rectified rig.
 pub struct RandomScenes {
     options: Options,
     rig: RectifiedRig,
@@ -28,6 +30,7 @@ pub struct RandomScenes {
 
 /// Side of the materials' textures.
 const TEXELS: usize = 256;
+const MATERIALS: usize = 48;
 
 impl RandomScenes {
     /// Reads `seed=1,frames=60,width=384,height=288,baseline=0.12,noise=1`, each optional.
@@ -39,7 +42,7 @@ impl RandomScenes {
         let rig = straight_rig(&options);
         let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
         rng.set_stream(u64::MAX);
-        let seeds: Vec<u32> = (0..16).map(|_| rng.random()).collect();
+        let seeds: Vec<u32> = (0..MATERIALS).map(|_| rng.random()).collect();
         Ok(Self {
             materials: (seeds.into_par_iter().enumerate())
                 .map(|(k, seed)| material(k, seed))
@@ -149,6 +152,8 @@ struct Shape {
     material: usize,
     /// Metres a texel.
     texel: f64,
+    /// How much of the material's contrast is left; what goes is replaced by grey.
+    contrast: f32,
     tint: Vector3<f32>,
 }
 
@@ -156,11 +161,17 @@ enum Body {
     /// The plane across the third axis, cut to a rectangle or an ellipse of half sizes; without end.
     Rectangle(f64, f64),
     Ellipse(f64, f64),
+    /// A rectangle with a window of this share of its sizes.
+    Frame(f64, f64, f64),
+    /// A leaf: radius, lobes, depth of the lobes as a share.
+    Leaf(f64, f64, f64),
     Plane,
     /// Half axes.
     Ellipsoid(Vector3<f64>),
     /// About the third axis: radius and half length, without caps.
     Pipe(f64, f64),
+    /// About the third axis, its tip in the centre: radius at the base and height, without a base.
+    Cone(f64, f64),
     Faces(Rock),
 }
 
@@ -187,6 +198,14 @@ impl Shape {
             Body::Plane => flat(&|_, _| true)?,
             Body::Rectangle(w, h) => flat(&|x, y| x.abs() < *w && y.abs() < *h)?,
             Body::Ellipse(w, h) => flat(&|x, y| (x / w).powi(2) + (y / h).powi(2) < 1.0)?,
+            Body::Frame(w, h, window) => flat(&|x, y| {
+                let (x, y) = (x.abs() / w, y.abs() / h);
+                x < 1.0 && y < 1.0 && (x > *window || y > *window)
+            })?,
+            Body::Leaf(radius, lobes, depth) => flat(&|x, y| {
+                let rim = radius * (1.0 - depth * (0.5 + 0.5 * (lobes * y.atan2(x)).cos()));
+                x * x + y * y < rim * rim
+            })?,
             Body::Ellipsoid(size) => {
                 let (o, d) = (o.component_div(size), d.component_div(size));
                 first_root(d.norm_squared(), o.dot(&d), o.norm_squared() - 1.0, |_| {
@@ -198,6 +217,13 @@ impl Shape {
                 let c = o2.norm_squared() - radius * radius;
                 let within = |t: f64| (o.z + d.z * t).abs() < *half;
                 first_root(d2.norm_squared(), o2.dot(&d2), c, within)?
+            }
+            Body::Cone(radius, height) => {
+                let slope = (radius / height).powi(2);
+                let squared =
+                    |a: &Vector3<f64>, b: &Vector3<f64>| a.xy().dot(&b.xy()) - slope * a.z * b.z;
+                let within = |t: f64| (0.0..*height).contains(&(o.z + d.z * t));
+                first_root(squared(&d, &d), squared(&o, &d), squared(&o, &o), within)?
             }
             Body::Faces(_) => return None,
         };
@@ -221,7 +247,11 @@ impl Shape {
             (normal, Vector2::new(p[a], p[b]), axes)
         };
         match &self.body {
-            Body::Plane | Body::Rectangle(..) | Body::Ellipse(..) => (z, p.xy(), [x, y]),
+            Body::Plane
+            | Body::Rectangle(..)
+            | Body::Ellipse(..)
+            | Body::Frame(..)
+            | Body::Leaf(..) => (z, p.xy(), [x, y]),
             Body::Ellipsoid(size) => {
                 let n = p.component_div(size).component_div(size).normalize();
                 projected(self.axes * n)
@@ -230,6 +260,10 @@ impl Shape {
                 let out = (x * p.x + y * p.y) / *radius;
                 let around = z.cross(&out);
                 (out, Vector2::new(p.y.atan2(p.x) * radius, p.z), [around, z])
+            }
+            Body::Cone(radius, height) => {
+                let out = Vector3::new(p.x, p.y, -p.z * (radius / height).powi(2)).normalize();
+                projected(self.axes * out)
             }
             Body::Faces(rock) => projected(rock.faces[face as usize].0),
         }
@@ -245,91 +279,209 @@ fn first_root(a: f64, b: f64, c: f64, accept: impl Fn(f64) -> bool) -> Option<f6
         .find(|t| *t > NEAR && accept(*t))
 }
 
+/// Where and how shapes are put.
+struct Stage<'a> {
+    rig: &'a RectifiedRig,
+    /// Depths of the middle of the wall and of the nearest shape, metres.
+    wall: f64,
+    nearest: f64,
+    /// How far below the cameras the floor is, where there is one.
+    floor: Option<f64>,
+    rng: &'a mut ChaCha8Rng,
+}
+
+impl Stage<'_> {
+    /// Metres that so many pixels cover at a depth.
+    fn pixels(&self, z: f64, pixels: f64) -> f64 {
+        z / self.rig.fx * pixels
+    }
+
+    /// A place in the picture, a little beyond its borders; as many at each disparity.
+    fn place(&mut self) -> Vector3<f64> {
+        let share: f64 = self.rng.random_range(0.0..1.0);
+        let z = 1.0 / ((1.0 - share) / self.wall + share / self.nearest);
+        let [x, y] = [self.rig.width, self.rig.height]
+            .map(|n| n as f64 * self.rng.random_range(-0.55..0.55));
+        Vector3::new(self.pixels(z, x), self.pixels(z, y), z)
+    }
+
+    /// A turn about any axis, by up to `most` radians.
+    fn turn(&mut self, most: f64) -> UnitQuaternion<f64> {
+        let axis = Vector3::from_fn(|_, _| self.rng.random_range(-1.0..1.0));
+        let angle = self.rng.random_range(0.0..most);
+        UnitQuaternion::from_scaled_axis(axis.normalize() * angle)
+    }
+
+    /// A body in a material of its own.
+    fn paint(&mut self, body: Body, centre: Vector3<f64>, axes: UnitQuaternion<f64>) -> Shape {
+        let radius = match &body {
+            Body::Plane => f64::INFINITY,
+            Body::Rectangle(w, h) | Body::Frame(w, h, _) => w.hypot(*h),
+            Body::Ellipse(w, h) => w.max(*h),
+            Body::Leaf(radius, ..) => *radius,
+            Body::Ellipsoid(size) => size.max(),
+            Body::Pipe(r, half) => r.hypot(*half),
+            Body::Cone(r, height) => r.hypot(*height),
+            Body::Faces(rock) => rock.radius,
+        };
+        let rng = &mut *self.rng;
+        let bright = rng.random_range(0.15..1.2f32);
+        // Half of the shapes are all but grey.
+        let colourful = if rng.random_bool(0.5) { 0.4 } else { 0.06 };
+        Shape {
+            body,
+            centre,
+            radius,
+            axes: axes.to_rotation_matrix().into_inner(),
+            material: rng.random_range(0..MATERIALS),
+            // A texel is a quarter of a pixel up to four, seen at the shape's depth.
+            texel: centre.z.max(0.5) / self.rig.fx * 4f64.powf(rng.random_range(-1.0..1.0)),
+            // Every sixth is nearly uniform.
+            contrast: match rng.random_bool(0.17) {
+                true => rng.random_range(0.02..0.2),
+                false => rng.random_range(0.35..1.0),
+            },
+            tint: Vector3::from_fn(|_, _| bright * rng.random_range(1.0 - colourful..1.0)),
+        }
+    }
+
+    /// A body by itself.
+    fn single(&mut self) -> Shape {
+        let mut centre = self.place();
+        let z = centre.z;
+        // Small ones are as many as large ones at each doubling.
+        let pixels = self.rig.width as f64 * 0.24 * 12f64.powf(self.rng.random_range(-1.0..0.0));
+        let size = self.pixels(z, pixels);
+        let [a, b, c] = std::array::from_fn(|_| size * self.rng.random_range(0.4..1.0));
+        if let Some(floor) = self.floor
+            && self.rng.random_bool(0.5)
+        {
+            centre.y = floor - c;
+        }
+        let rng = &mut *self.rng;
+        let body = match rng.random_range(0..10) {
+            0 | 1 => Body::Rectangle(a, b),
+            2 => Body::Ellipse(a, b),
+            3 => Body::Frame(a, b, rng.random_range(0.5..0.95)),
+            4 => Body::Leaf(a, rng.random_range(2..8).into(), rng.random_range(0.2..0.9)),
+            5 => Body::Ellipsoid(Vector3::new(a, b, c)),
+            // Thin: one to eight pixels.
+            6 => Body::Pipe(
+                z / self.rig.fx * 8f64.powf(rng.random_range(-0.33..0.67)),
+                3.0 * size,
+            ),
+            7 => Body::Pipe(0.4 * a, 1.5 * b),
+            8 => Body::Cone(0.5 * a, 2.0 * b),
+            _ => Body::Faces(Rock::random(Point3::origin(), Vector3::new(a, b, c), rng)),
+        };
+        let axes = match &body {
+            // Rather facing the cameras than edge on.
+            Body::Rectangle(..) | Body::Ellipse(..) | Body::Frame(..) | Body::Leaf(..) => {
+                self.turn(1.1)
+            }
+            // Standing, rather.
+            Body::Cone(..) if self.rng.random_bool(0.7) => {
+                let upright = Rotation3::from_axis_angle(&Vector3::x_axis(), -FRAC_PI_2);
+                self.turn(0.3) * UnitQuaternion::from_rotation_matrix(&upright)
+            }
+            _ => self.turn(3.1),
+        };
+        self.paint(body, centre, axes)
+    }
+
+    /// Many alike, in a row as bars of a fence: the background is seen between them.
+    fn fence(&mut self) -> Vec<Shape> {
+        let centre = self.place();
+        let unit = self.pixels(centre.z, 1.0);
+        let (thick, length) = (
+            unit * self.rng.random_range(1.0..6.0),
+            unit * self.rng.random_range(20.0..90.0),
+        );
+        let step = thick * self.rng.random_range(2.5..6.0);
+        let axes = self.turn(1.0);
+        let across = axes * Vector3::x() * step;
+        let count = self.rng.random_range(3..12);
+        let first = self.paint(Body::Plane, centre, axes);
+        let bar = |k: i32| {
+            let centre = centre + across * f64::from(k - count / 2);
+            Shape {
+                body: Body::Rectangle(thick / 2.0, length),
+                centre,
+                radius: length.hypot(thick),
+                ..first
+            }
+        };
+        (0..count).map(bar).collect()
+    }
+
+    /// A twig that turns and forks as it grows.
+    fn twig(&mut self) -> Vec<Shape> {
+        let root = self.place();
+        let unit = self.pixels(root.z, 1.0);
+        let bark = self.paint(Body::Plane, root, UnitQuaternion::identity());
+        let mut tips = vec![(root, self.turn(3.1), unit * self.rng.random_range(1.0..4.0))];
+        let mut shapes = Vec::new();
+        while let Some((from, axes, thick)) = tips.pop() {
+            let half = unit * self.rng.random_range(5.0..16.0);
+            let along = axes * Vector3::z() * half;
+            shapes.push(Shape {
+                body: Body::Pipe(thick, half),
+                centre: from + along,
+                radius: half.hypot(thick),
+                axes: axes.to_rotation_matrix().into_inner(),
+                ..bark
+            });
+            if shapes.len() + tips.len() >= 12 {
+                continue;
+            }
+            for _ in 0..self.rng.random_range(1..=2) {
+                let turn = self.turn(0.9);
+                tips.push((from + along * 2.0, turn * axes, thick * 0.8));
+            }
+        }
+        shapes
+    }
+}
+
 impl<'a> Shapes<'a> {
     fn random(rig: &RectifiedRig, materials: &'a [Texture<3>], rng: &mut ChaCha8Rng) -> Self {
-        // Depths by disparity: the wall at 1 to 4 % of the width, shapes up to a quarter of it.
+        // Depths by disparity: the wall at 0.5 to 6 % of the width, shapes up to 28 %.
         let depth = |share: f64| rig.fx * rig.baseline / (share * rig.width as f64);
-        let wall = depth(rng.random_range(0.01..0.04));
-        let nearest = depth(0.25);
-        let turn = |rng: &mut ChaCha8Rng, most: f64| {
-            let axis = Vector3::from_fn(|_, _| rng.random_range(-1.0..1.0));
-            let angle = rng.random_range(0.0..most);
-            UnitQuaternion::from_scaled_axis(axis.normalize() * angle)
+        let wall = depth(0.005 * 12f64.powf(rng.random_range(0.0..1.0)));
+        let floor = rng.random_bool(0.7);
+        let floor = floor.then(|| rng.random_range(0.15..0.5) * wall);
+        let mut stage = Stage {
+            rig,
+            wall,
+            nearest: depth(0.28),
+            floor,
+            rng,
         };
-        let paint =
-            |body: Body, centre: Vector3<f64>, axes: UnitQuaternion<f64>, rng: &mut ChaCha8Rng| {
-                let radius = match &body {
-                    Body::Plane => f64::INFINITY,
-                    Body::Rectangle(w, h) => w.hypot(*h),
-                    Body::Ellipse(w, h) => w.max(*h),
-                    Body::Ellipsoid(size) => size.max(),
-                    Body::Pipe(r, half) => r.hypot(*half),
-                    Body::Faces(rock) => rock.radius,
-                };
-                let bright = rng.random_range(0.25..1.0f32);
-                Shape {
-                    body,
-                    centre,
-                    radius,
-                    axes: axes.to_rotation_matrix().into_inner(),
-                    material: rng.random_range(0..materials.len()),
-                    // A texel is a third of a pixel up to three, seen at the shape's depth.
-                    texel: centre.z.max(0.5) / rig.fx * 3f64.powf(rng.random_range(-1.0..1.0)),
-                    tint: Vector3::from_fn(|_, _| bright * rng.random_range(0.6..1.0f32)),
-                }
-            };
 
         let mut shapes = Vec::new();
-        let wall_turn = turn(rng, 0.7);
-        shapes.push(paint(
-            Body::Plane,
-            Vector3::new(0.0, 0.0, wall),
-            wall_turn,
-            rng,
-        ));
-        let floor = rng.random_range(0.15..0.5) * wall;
-        let has_floor = rng.random_bool(0.7);
-        if has_floor {
-            let level = Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::FRAC_PI_2);
-            let axes = turn(rng, 0.15) * UnitQuaternion::from_rotation_matrix(&level);
-            shapes.push(paint(
-                Body::Plane,
-                Vector3::new(0.0, floor, wall / 2.0),
-                axes,
-                rng,
-            ));
+        // Walls without end meet in corners.
+        for k in 0..stage.rng.random_range(1..4) {
+            let away = if k == 0 {
+                1.0
+            } else {
+                stage.rng.random_range(0.7..1.4)
+            };
+            let turn = stage.turn(0.8);
+            shapes.push(stage.paint(Body::Plane, Vector3::new(0.0, 0.0, wall * away), turn));
         }
-        for _ in 0..rng.random_range(6..22) {
-            // As many shapes at each disparity.
-            let share: f64 = rng.random_range(0.0..1.0);
-            let z = 1.0 / ((1.0 - share) / wall + share / nearest);
-            let across = |pixels: usize, f: f64, at: f64| z * pixels as f64 / f * at;
-            let mut centre = Vector3::new(
-                across(rig.width, rig.fx, rng.random_range(-0.55..0.55)),
-                across(rig.height, rig.fy, rng.random_range(-0.55..0.55)),
-                z,
-            );
-            let size = across(rig.width, rig.fx, rng.random_range(0.03..0.22));
-            let mut axis = || size * rng.random_range(0.4..1.0);
-            let (a, b, c) = (axis(), axis(), axis());
-            if has_floor && rng.random_bool(0.5) {
-                centre.y = floor - c;
-            }
-            let body = match rng.random_range(0..6) {
-                0 => Body::Rectangle(a, b),
-                1 => Body::Ellipse(a, b),
-                2 => Body::Ellipsoid(Vector3::new(a, b, c)),
-                // Thin: one to four pixels.
-                3 => Body::Pipe(z / rig.fx * rng.random_range(0.5..2.0), 3.0 * size),
-                4 => Body::Pipe(0.4 * a, 1.5 * b),
-                _ => Body::Faces(Rock::random(Point3::origin(), Vector3::new(a, b, c), rng)),
-            };
-            let axes = match &body {
-                // Rather facing the cameras than edge on.
-                Body::Rectangle(..) | Body::Ellipse(..) => turn(rng, 1.1),
-                _ => turn(rng, 3.1),
-            };
-            shapes.push(paint(body, centre, axes, rng));
+        if let Some(floor) = floor {
+            let level = Rotation3::from_axis_angle(&Vector3::x_axis(), FRAC_PI_2);
+            let axes = stage.turn(0.15) * UnitQuaternion::from_rotation_matrix(&level);
+            shapes.push(stage.paint(Body::Plane, Vector3::new(0.0, floor, wall / 2.0), axes));
+        }
+        for _ in 0..stage.rng.random_range(5..40) {
+            shapes.push(stage.single());
+        }
+        for _ in 0..stage.rng.random_range(0..3) {
+            shapes.extend(stage.fence());
+        }
+        for _ in 0..stage.rng.random_range(0..4) {
+            shapes.extend(stage.twig());
         }
         let to_lamp = Vector3::new(
             rng.random_range(-1.0..1.0),
@@ -385,15 +537,20 @@ impl Scene for Shapes<'_> {
         });
         let at = (place / shape.texel).map(|v| wrapped(v, TEXELS as f64));
         let paint = self.materials[shape.material].mean(at, Footprint::new(a, b));
+        let paint = paint.map(|v| 0.4 + (v - 0.4) * shape.contrast);
         let lit = normal.cast::<f32>().dot(&self.to_lamp).max(0.0) * (1.0 - self.ambient);
         Vector3::from(paint).component_mul(&shape.tint) * (self.ambient + lit)
     }
 }
 
 /// One of the kinds of material: noise of every size, fine noise, stripes, tiles, spots, or nearly
-/// nothing; in two colours.
+/// nothing, in two colours; and every third time leaves upon leaves.
 fn material(kind: usize, seed: u32) -> Texture<3> {
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(seed));
+    if kind.is_multiple_of(3) {
+        return Texture::new(TEXELS, true, fallen_leaves(&mut rng));
+    }
+    let kind = kind / 3 * 2 + kind % 3 - 1;
     let waves: &[(u32, f32)] = match kind % 4 {
         0 => &[(4, 1.2), (9, 1.2), (19, 1.2), (41, 1.2), (85, 1.2)],
         1 => &[(60, 2.0), (100, 2.0)],
@@ -427,6 +584,53 @@ fn material(kind: usize, seed: u32) -> Texture<3> {
         (dark * (1.0 - share) + bright * share).into()
     };
     Texture::new(TEXELS, true, image.into_iter().map(painted).collect())
+}
+
+/// Discs and bars of every size and colour, one upon the other: as many edges of every length as
+/// photographs have (Lee 2001, "Occlusion models for natural images"), and none of them an edge of depth.
+fn fallen_leaves(rng: &mut ChaCha8Rng) -> Vec<[f32; 3]> {
+    let side = TEXELS as i32;
+    let grey = rng.random_range(0.0..1.0f32);
+    let spread = rng.random_range(0.3..1.0f32);
+    let mut image = vec![[0.4; 3]; TEXELS * TEXELS];
+    for _ in 0..1500 {
+        // Sizes by the inverse cube, which looks alike at every distance.
+        let share: f32 = rng.random_range(0.0..1.0);
+        let (least, most) = (1.5f32, 60.0f32);
+        let radius = 1.0 / (share / least.powi(2) + (1.0 - share) / most.powi(2)).sqrt();
+        let [cx, cy] = std::array::from_fn(|_| rng.random_range(0.0..side as f32));
+        let flat = rng.random_range(0.15..1.0f32);
+        let (sin, cos) = rng.random_range(0.0..std::f32::consts::PI).sin_cos();
+        let square = rng.random_bool(0.5);
+        let bright: f32 = 0.45 + spread * rng.random_range(-0.45..0.45f32);
+        let colour: [f32; 3] = std::array::from_fn(|_| {
+            let own = rng.random_range(0.0..0.9f32);
+            bright * grey + own * (1.0 - grey)
+        });
+        let grain = rng.random_range(0.0..0.12f32);
+        let reach = (radius * 1.5).ceil() as i32;
+        for dy in -reach..=reach {
+            for dx in -reach..=reach {
+                let (fx, fy) = (dx as f32, dy as f32);
+                let (x, y) = (
+                    (fx * cos + fy * sin) / radius,
+                    (fy * cos - fx * sin) / (radius * flat),
+                );
+                let inside = if square {
+                    x.abs().max(y.abs()) < 1.0
+                } else {
+                    x * x + y * y < 1.0
+                };
+                if inside {
+                    let wrap = |c: f32, d: i32| (c as i32 + d).rem_euclid(side) as usize;
+                    let noise = grain * rng.random_range(-1.0..1.0f32);
+                    image[wrap(cy, dy) * TEXELS + wrap(cx, dx)] =
+                        colour.map(|c| (c + noise).clamp(0.0, 1.0));
+                }
+            }
+        }
+    }
+    image
 }
 
 #[cfg(test)]
