@@ -10,8 +10,16 @@ use barchan_train::RunDir;
 /// Weights that are part of this program.
 const SHIPPED: [(&str, &[u8]); 1] = [("tiny", include_bytes!("../checkpoints/tiny.safetensors"))];
 
-/// The network of a shipped name, a safetensors file, or a run directory of `barchan train`.
+/// The network of a shipped name, a safetensors file, or a run directory of `barchan train`; with
+/// `:192` after it, searching 192 disparities.
 pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
+    if let Some((name, range)) = model.rsplit_once(':')
+        && let Ok(range) = range.parse()
+        && !Path::new(model).exists()
+    {
+        let net = load_net(name, device)?.with_max_disparity(range);
+        return net.with_context(|| model.to_owned());
+    }
     if let Some((name, bytes)) = SHIPPED.iter().find(|(name, _)| *name == model) {
         return Ok(weights::from_bytes(bytes, Path::new(name), device)?);
     }
@@ -32,7 +40,7 @@ pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
 }
 
 /// The engine for a model: ONNX Runtime for `x.onnx`, Burn for weights and shipped names, `sgm` and
-/// `bm` without any network, `sgm:192` to search 192 disparities.
+/// `bm` without any network; `rover:192` and `sgm:192` search 192 disparities.
 pub fn load_engine(
     model: &str,
     runtime: Option<&Path>,
