@@ -38,6 +38,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Train(Box<commands::train::Args>),
+    Adapt(commands::adapt::Args),
     Export(commands::export::Args),
     Probe(commands::probe::Args),
     Infer(commands::infer::Args),
@@ -58,6 +59,7 @@ fn main() -> ExitCode {
             Ok(false) => return ExitCode::from(commands::train::INTERRUPTED),
             other => other.map(|_| ()),
         },
+        Command::Adapt(args) => commands::adapt::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output, runtime),
         Command::Probe(args) => commands::probe::run(args, &output, runtime),
         Command::Infer(args) => commands::infer::run(args, &output, runtime),

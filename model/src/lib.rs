@@ -16,6 +16,7 @@ mod net;
 pub mod onnx;
 mod ops;
 pub mod planar;
+pub mod refinement;
 pub mod regression;
 pub mod volume;
 pub mod volumetric;
@@ -23,7 +24,7 @@ pub mod weights;
 
 pub use net::{AggregationConfig, NetConfig, Prediction, Preset, StereoNet};
 pub use ops::{Correlated, Execute, Kernel, Ops};
-pub use regression::Argmin;
+pub use regression::{Argmin, SCALE};
 
 /// Re-exported so that users of this crate need not name Burn.
 pub use burn::tensor::{Device, Tensor};

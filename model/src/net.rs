@@ -8,6 +8,7 @@ use crate::ModelError;
 use crate::features::Features;
 use crate::ops::{Execute, Ops};
 use crate::planar::{Planar, PlanarConfig};
+use crate::refinement::Refinement;
 use crate::regression::{Argmin, Regression, SCALE};
 use crate::volume::census_descriptors;
 use crate::volumetric::{Volumetric, VolumetricConfig};
@@ -44,6 +45,7 @@ impl Preset {
                     blocks: [0, 1, 1],
                 }),
                 up_sampling: 16,
+                refinement: 0,
             },
             Self::Rover => NetConfig {
                 max_disparity: 96,
@@ -55,6 +57,7 @@ impl Preset {
                     blocks: [0, 2, 1],
                 }),
                 up_sampling: 32,
+                refinement: 48,
             },
             Self::Paper => NetConfig {
                 max_disparity: 96,
@@ -65,6 +68,7 @@ impl Preset {
                     census: true,
                 }),
                 up_sampling: 32,
+                refinement: 48,
             },
         }
     }
@@ -89,6 +93,9 @@ pub struct NetConfig {
     pub features: [usize; 4],
     /// Hidden channels of the up-sampling.
     pub up_sampling: usize,
+    /// Hidden channels of the refinement before it; 0 is none.
+    #[serde(default)]
+    pub refinement: usize,
     /// How costs become logits.
     pub aggregation: AggregationConfig,
 }
@@ -118,6 +125,7 @@ impl NetConfig {
         }
         let mut channels = self.features.to_vec();
         channels.push(self.up_sampling);
+        channels.push(self.refinement.max(1));
         match &self.aggregation {
             AggregationConfig::Planar(c) => {
                 channels.extend(c.matching.iter().chain(&c.groups).chain(&c.channels));
@@ -147,9 +155,12 @@ impl NetConfig {
     }
 }
 
-/// What the network says of a pair, each `[B, 1, H, W]`.
+/// What the network says of a pair; maps are `[B, 1, H, W]` but for the logits.
 #[derive(Clone, Debug)]
 pub struct Prediction<M> {
+    /// Logits of the distribution that all else is made of: `[B, bins, h, w]` at a quarter of the
+    /// resolution of the padded images, near to far. Bin `k` stands for `4 (bins - 1 - k)` pixels.
+    pub logits: M,
     /// Disparity of the left image, pixels.
     pub disparity: M,
     /// Standard deviation of the probability distribution, pixels.
@@ -164,6 +175,7 @@ pub struct Prediction<M> {
 pub struct StereoNet {
     features: Features,
     aggregation: Aggregation,
+    refinement: Option<Refinement>,
     regression: Regression,
     #[module(skip)]
     config: NetConfig,
@@ -209,6 +221,8 @@ impl StereoNet {
                     Aggregation::Volumetric(Volumetric::init(c, quarter, device))
                 }
             },
+            refinement: (config.refinement > 0)
+                .then(|| Refinement::init(quarter, config.refinement, device)),
             regression: Regression::init(quarter, config.up_sampling, device),
             config: config.clone(),
         };
@@ -242,14 +256,14 @@ impl StereoNet {
         )
     }
 
-    /// [`StereoNet::forward`] with the mean over all bins, so that every bin gets a gradient.
-    pub fn forward_training(&self, left: Tensor<4>, right: Tensor<4>) -> Prediction<Tensor<4>> {
-        self.run(
-            &mut Execute::on(left.device()),
-            Argmin::Everywhere,
-            &left,
-            &right,
-        )
+    /// [`StereoNet::forward`] with the mean over the bins that `argmin` says.
+    pub fn forward_training(
+        &self,
+        argmin: Argmin,
+        left: &Tensor<4>,
+        right: &Tensor<4>,
+    ) -> Prediction<Tensor<4>> {
+        self.run(&mut Execute::on(left.device()), argmin, left, right)
     }
 
     /// The definition, for whoever interprets it.
@@ -282,10 +296,16 @@ impl StereoNet {
             }
         };
         let (context, _) = ops.halves(&features.quarter);
-        let full = self
-            .regression
-            .forward(ops, bins, argmin, &logits, &context);
+        let full = self.regression.forward(
+            ops,
+            bins,
+            argmin,
+            &logits,
+            &context,
+            self.refinement.as_ref(),
+        );
         Prediction {
+            logits: full.logits,
             disparity: ops.crop_to(left, &full.disparity),
             sigma: ops.crop_to(left, &full.sigma),
             confidence: ops.crop_to(left, &full.confidence),

@@ -145,12 +145,13 @@ pub trait Ops {
     fn channel_max(&mut self, x: &Self::Map) -> Self::Map;
     /// The number of the largest channel at every pixel.
     fn channel_argmax(&mut self, x: &Self::Map) -> Self::Map;
-    /// The sum of every 3x3 neighbour (row by row, the border repeated) of a map of one channel, times its
+    /// The sum of every 3x3 neighbour, `reach` pixels apart (row by row, the border repeated), of a map of one channel, times its
     /// weights: channel `n * shares + s` of `weights` is that of neighbour `n` in share `s`. `shares` channels.
     fn mix_neighbours(
         &mut self,
         name: &str,
         shares: usize,
+        reach: usize,
         weights: &Self::Map,
         x: &Self::Map,
     ) -> Self::Map;
@@ -338,15 +339,16 @@ impl Ops for Execute {
         &mut self,
         _: &str,
         shares: usize,
+        reach: usize,
         weights: &Tensor<4>,
         x: &Tensor<4>,
     ) -> Tensor<4> {
         let [batch, _, height, width] = x.dims();
-        let padded = x.clone().pad((1, 1, 1, 1), PadMode::Edge);
+        let padded = x.clone().pad((reach, reach, reach, reach), PadMode::Edge);
         let around = (0..NEIGHBOURS)
             .map(|n| {
-                let row = padded.clone().narrow(2, n / 3, height);
-                row.narrow(3, n % 3, width)
+                let row = padded.clone().narrow(2, reach * (n / 3), height);
+                row.narrow(3, reach * (n % 3), width)
             })
             .collect();
         let around = Tensor::cat(around, 1).reshape([batch, NEIGHBOURS, 1, height, width]);

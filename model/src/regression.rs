@@ -6,6 +6,7 @@ use burn::tensor::Device;
 
 use crate::features::{conv1x1, conv3x3};
 use crate::ops::NEIGHBOURS;
+use crate::refinement::Refinement;
 use crate::{Kernel, Ops, Prediction};
 
 /// The volume stands at this fraction of the resolution, so a bin is this many pixels.
@@ -16,10 +17,10 @@ const SUBPIXELS: usize = SCALE * SCALE;
 /// Which bins the mean is taken over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Argmin {
-    /// All: every bin gets a gradient. For training.
+    /// All: every bin gets a gradient. For training on images alone.
     Everywhere,
     /// Two on either side of the most probable one: a second peak does not draw the mean into the empty
-    /// space between. For inference.
+    /// space between. For inference, and for training where the distribution has a loss of its own.
     AroundPeak,
 }
 
@@ -40,7 +41,8 @@ impl Regression {
     }
 
     /// Disparity, standard deviation (pixels) and confidence at full resolution `[B, 1, 4h, 4w]`
-    /// from logits `[B, bins, h, w]`, near to far, and the left image's features `[B, context, h, w]`.
+    /// from logits `[B, bins, h, w]`, near to far, and the left image's features `[B, context, h, w]`;
+    /// refined on the way where there is a `refinement`.
     pub fn forward<O: Ops>(
         &self,
         ops: &mut O,
@@ -48,14 +50,20 @@ impl Regression {
         argmin: Argmin,
         logits: &O::Map,
         context: &O::Map,
+        refinement: Option<&Refinement>,
     ) -> Prediction<O::Map> {
+        let coarse = moments(ops, bins, argmin, logits);
+        let (coarse, context) = match refinement {
+            Some(refinement) => refinement.forward(ops, &coarse, context),
+            None => (coarse, context.clone()),
+        };
         let Moments {
             mean,
             square,
             confidence,
-        } = moments(ops, bins, argmin, logits);
+        } = coarse;
 
-        let hidden = ops.conv2d("regression.look", &self.look, context);
+        let hidden = ops.conv2d("regression.look", &self.look, &context);
         let hidden = ops.relu(&hidden);
         let mix = ops.conv2d("regression.mix", &self.mix, &hidden);
         // Positive weights over their sum. Far below zero a sigmoid is an exponential, so this chooses as a
@@ -64,7 +72,8 @@ impl Regression {
         let total = ops.sum_neighbours("regression.weights", SUBPIXELS, &weights);
         let total = ops.affine(1.0, 1e-12, &total);
         let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
-            let mixed = ops.mix_neighbours(&format!("regression.{name}"), SUBPIXELS, &weights, x);
+            let mixed =
+                ops.mix_neighbours(&format!("regression.{name}"), SUBPIXELS, 1, &weights, x);
             let mixed = ops.div(&mixed, &total);
             ops.depth_to_space(SCALE, &mixed)
         };
@@ -86,6 +95,7 @@ impl Regression {
         let variance = ops.clamp(1.5e-4, f32::MAX, &variance);
         let sigma = ops.sqrt(&variance);
         Prediction {
+            logits: logits.clone(),
             disparity: ops.affine(SCALE as f32, 0.0, &mean),
             sigma: ops.affine(SCALE as f32, 0.0, &sigma),
             confidence,
@@ -94,12 +104,13 @@ impl Regression {
 }
 
 /// Of the distribution at every coarse pixel, in bins.
-struct Moments<M> {
-    mean: M,
+#[derive(Clone)]
+pub(crate) struct Moments<M> {
+    pub mean: M,
     /// Second moment about zero, of a distribution of that mean and of the whole distribution's spread about it.
-    square: M,
+    pub square: M,
     /// Probability near the peak, or near the mean.
-    confidence: M,
+    pub confidence: M,
 }
 
 fn moments<O: Ops>(ops: &mut O, bins: usize, argmin: Argmin, logits: &O::Map) -> Moments<O::Map> {

@@ -1,5 +1,6 @@
 //! One module per subcommand.
 
+pub mod adapt;
 pub mod data;
 pub mod doctor;
 pub mod eval;

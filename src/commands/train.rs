@@ -100,6 +100,9 @@ struct Settings {
     /// The learning rate is divided by ten from this epoch on [default: 7, or never with --finetune]
     #[arg(long)]
     drop_epoch: Option<usize>,
+    /// Let the learning rate fall along half a cosine to a hundredth at the last step, instead of dropping it
+    #[arg(long, conflicts_with = "drop_epoch")]
+    cosine: bool,
     /// Longest gradient, Euclidean norm over all weights; 0 does not clip [default: 1]
     #[arg(long)]
     clip: Option<f32>,
@@ -483,6 +486,7 @@ fn configure(
     set(&mut config.schedule.epochs, &args.epochs);
     set(&mut config.schedule.lr, &args.lr);
     set(&mut config.schedule.drop_epoch, &args.drop_epoch);
+    config.schedule.cosine |= args.cosine;
     loss.apply(&mut config.loss);
     let (to, from) = (&mut config.augmentation, augmentation);
     set(&mut to.noise, &from.noise);

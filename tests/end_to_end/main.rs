@@ -1,5 +1,6 @@
 //! The program as its users run it.
 
+mod adapt;
 mod bad_input;
 mod chain;
 mod data;

@@ -68,6 +68,8 @@ class StereoNet(nn.Module):
         self.features = Features(channels)
         (kind, aggregation), = config["aggregation"].items()
         self.aggregation = {"planar": Planar, "volumetric": Volumetric}[kind](aggregation, channels)
+        hidden = config.get("refinement", 0)
+        self.refinement = Refinement(channels[1], hidden) if hidden else None
         self.regression = Regression(channels[1], config["up_sampling"])
 
     def forward(self, left: Tensor, right: Tensor) -> tuple:
@@ -77,7 +79,7 @@ class StereoNet(nn.Module):
 
         quarter, eighth = self.features(images)
         logits = self.aggregation(quarter.chunk(2), eighth.chunk(2), images.chunk(2), self.bins)
-        full = self.regression(logits, quarter.chunk(2)[0])
+        full = self.regression(logits, quarter.chunk(2)[0], self.refinement)
         return tuple(x[:, :, :height, :width] for x in full)
 
 
@@ -276,6 +278,44 @@ class Volumetric(nn.Module):
         return logits.squeeze(1)
 
 
+def mix(x: Tensor, weights: Tensor, reach: int) -> Tensor:
+    """3x3 neighbours of a map, `reach` pixels apart, mixed; `weights` are [B, 9, n, H, W] and sum to one."""
+    around = F.unfold(F.pad(x, (reach,) * 4, mode="replicate"), 3, dilation=reach)
+    return (weights * around.unflatten(2, x.shape[2:]).unsqueeze(2)).sum(1)
+
+
+def shares(logits: Tensor, of: int) -> Tensor:
+    """Weights of 3x3 neighbours in each of `of` mixtures."""
+    weights = logits.sigmoid().unflatten(1, (9, of))
+    return weights / (weights.sum(1, keepdim=True) + 1e-12)
+
+
+class Refinement(nn.Module):
+    """Answers mixed from those further and further in: by whom, the image and the answers tell."""
+
+    REACHES = (4, 2, 1)
+
+    def __init__(self, context: int, hidden: int):
+        super().__init__()
+        self.image = nn.Conv2d(context, hidden, 3, 1, 1)
+        self.answer = nn.Conv2d(2, hidden, 3, 1, 1)
+        self.down = nn.Conv2d(hidden, hidden, 3, 2, 1)
+        self.down_more = nn.Conv2d(hidden, hidden, 3, 1, 1)
+        self.up = nn.Conv2d(hidden, context, 1)
+        self.across = nn.Conv2d(hidden, context, 1)
+        self.weights = nn.ModuleList(nn.Conv2d(context, 9, 1) for _ in self.REACHES)
+
+    def forward(self, moments: tuple, context: Tensor) -> tuple:
+        answer, _, confidence = moments
+        high = F.relu(self.image(context) + self.answer(torch.cat([answer / 4, confidence], dim=1)))
+        low = F.relu(self.down_more(F.relu(self.down(high))))
+        features = F.relu(context + F.interpolate(self.up(low), scale_factor=2) + self.across(high))
+        for reach, layer in zip(self.REACHES, self.weights):
+            weights = shares(layer(features), 1)
+            moments = tuple(mix(x, weights, reach) for x in moments)
+        return moments, features
+
+
 class Regression(nn.Module):
     """From logits [B, D, H, W] to disparity, and to full resolution by mixing 3x3 neighbours with
     weights learned from the image."""
@@ -285,7 +325,7 @@ class Regression(nn.Module):
         self.look = nn.Conv2d(context, hidden, 3, 1, 1)
         self.mix = nn.Conv2d(hidden, 9 * SCALE**2, 1)
 
-    def forward(self, logits: Tensor, context: Tensor) -> tuple:
+    def forward(self, logits: Tensor, context: Tensor, refinement: nn.Module | None) -> tuple:
         probability = logits.softmax(1)
         disparity = torch.arange(logits.shape[1], device=logits.device).flip(0)[:, None, None]
 
@@ -301,15 +341,11 @@ class Regression(nn.Module):
         # E k^2 about zero, of a distribution of mean `answer` and the whole distribution's spread about it.
         square = mean((disparity - answer) ** 2) + answer**2
 
-        weights = self.mix(F.relu(self.look(context))).sigmoid().unflatten(1, (9, SCALE**2))
-        weights = weights / (weights.sum(1, keepdim=True) + 1e-12)
-
-        def up(x: Tensor) -> Tensor:
-            around = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3)
-            around = around.unflatten(2, x.shape[2:]).unsqueeze(2)
-            return F.pixel_shuffle((weights * around).sum(1), SCALE)
-
-        answer, square, confidence = up(answer), up(square), up(confidence)
+        coarse = (answer, square, confidence)
+        if refinement is not None:
+            coarse, context = refinement(coarse, context)
+        weights = shares(self.mix(F.relu(self.look(context))), SCALE**2)
+        answer, square, confidence = (F.pixel_shuffle(mix(x, weights, 1), SCALE) for x in coarse)
         # A certain answer between two bins needs both, and has a variance that says nothing of doubt.
         share = answer - answer.floor()
         variance = square - answer**2 - share * (1 - share)

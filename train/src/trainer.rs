@@ -4,7 +4,6 @@ use std::time::Instant;
 use barchan_datasets::{Prefetch, StereoSource};
 use barchan_model::{Device, StereoNet};
 use burn::module::Module;
-use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::Tensor;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -12,7 +11,8 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::batch::Sample;
-use crate::loss::{self, View};
+use crate::descent::{Descent, number};
+use crate::loss::View;
 use crate::pool::Pool;
 use crate::run_dir::Saved;
 use crate::validation::{Errors, to_plane};
@@ -80,16 +80,15 @@ struct State {
 /// Of so many held-out pairs the observer gets pictures.
 const PICTURES: usize = 3;
 
-/// Runs the schedule. Its private `step` is figure 4 of the paper.
+/// Runs the schedule.
 pub struct Trainer {
     config: TrainConfig,
     run: RunDir,
     device: Device,
     pool: Arc<Pool>,
-    net: StereoNet,
+    descent: Descent,
     /// The moving average of the weights, where there is one; without gradients.
     average: Option<StereoNet>,
-    optimizer: ModuleOptimizer,
     training: Vec<usize>,
     held_out: Vec<usize>,
     /// Steps done.
@@ -132,13 +131,16 @@ impl Trainer {
         let pool = Pool::new(sources, &config)?;
         let mut trainer = Self::prepare(run, config, pool, init)?;
         let saved = Saved {
-            net: trainer.net,
+            net: trainer.descent.net,
             average: trainer.average,
-            optimizer: trainer.optimizer,
+            optimizer: trainer.descent.optimizer,
         };
         let (saved, state) = trainer.run.restore::<State>(saved)?;
-        (trainer.net, trainer.average) = (saved.net, saved.average);
-        trainer.optimizer = saved.optimizer;
+        trainer.average = saved.average;
+        trainer.descent = Descent {
+            net: saved.net,
+            optimizer: saved.optimizer,
+        };
         if let Some((step, state)) = state {
             (trainer.step, trainer.state) = (step, state);
             trainer.saved = Some(step);
@@ -159,20 +161,13 @@ impl Trainer {
             Some(net) => net,
             None => StereoNet::init(&config.net, config.seed, &device)?,
         };
-        // Clipping is done here, over all weights together: Burn's own is layer by layer.
-        let optimizer = AdamConfig::new()
-            .with_beta_1(0.9)
-            .with_beta_2(0.999)
-            .with_epsilon(1e-8)
-            .init();
         Ok(Self {
             average: (config.average > 0.0).then(|| net.valid()),
             config,
             run,
             device,
             pool,
-            net,
-            optimizer,
+            descent: Descent::new(net),
             training,
             held_out,
             step: 0,
@@ -183,7 +178,9 @@ impl Trainer {
 
     /// The network that is validated and saved, without gradients: the average where there is one.
     pub fn net(&self) -> StereoNet {
-        self.average.clone().unwrap_or_else(|| self.net.valid())
+        self.average
+            .clone()
+            .unwrap_or_else(|| self.descent.net.valid())
     }
 
     /// The configuration.
@@ -253,55 +250,43 @@ impl Trainer {
         })
     }
 
-    /// One step: crop and augment, predict, compare by warping, follow the gradient.
+    /// One step: crop and augment, then figure 4 of the paper ([`Descent::step`]).
     fn step(&mut self, samples: &[Sample], epoch: usize) -> Result<LogLine, TrainError> {
         let started = Instant::now();
+        let config = &self.config;
         let mut rng = self.rng(2 * self.step as u64 + 1);
         let batch = Batch::crop(
             samples,
-            self.config.crop,
-            Some(&self.config.augmentation),
+            config.crop,
+            Some(&config.augmentation),
             &mut rng,
             &self.device,
         );
-
-        let (mut view, mirrored) = View::predict(&self.net, &batch, &self.config.loss);
-        // What the network cannot say it is not asked.
-        let most = (self.config.net.max_disparity - 2) as f32;
-        let reachable =
-            |[d, known]: [Tensor<4>; 2]| [d.clone(), known * d.lower_equal_scalar(most).float()];
-        view.proxies = view.proxies.map(reachable);
-        let (total, terms) = self.config.loss.self_supervised(&view, mirrored.as_ref());
-        let total = match (batch.truth.map(reachable), self.config.supervised) {
-            (Some([truth, known]), true) => loss::supervised(&view.disparity, &truth, &known),
-            (None, true) => {
-                return Err(TrainError::Config(format!(
-                    "--supervised: {} has no true disparity",
-                    batch.names
-                )));
-            }
-            (_, false) => total,
-        };
-        let value = total.clone().into_scalar::<f32>();
-        self.number(self.step + 1, "the loss", value, &batch.names)?;
-        let mut gradients = GradientsParams::from_grads(total.backward(), &self.net);
-        let norm = gradients::clip(&mut gradients, &self.net, self.config.clip);
-        self.number(self.step + 1, "the gradient", norm, &batch.names)?;
-        let lr = self.config.schedule.lr(epoch);
-        self.net = self.optimizer.step(lr, self.net.clone(), gradients);
+        if config.supervised && batch.truth.is_none() {
+            return Err(TrainError::Config(format!(
+                "--supervised: {} has no true disparity",
+                batch.names
+            )));
+        }
+        let lr = config.schedule.lr(self.step, self.steps_per_epoch());
+        let found = self
+            .descent
+            .step(&batch, &config.loss, config.supervised, config.clip, lr)
+            .map_err(|e| e.error(self.step + 1, &batch.names))?;
         self.step += 1;
         if let Some(average) = self.average.take() {
             let decay = self.config.average;
-            self.average = Some(averaging::follow(average, &self.net, decay, self.step));
+            let net = &self.descent.net;
+            self.average = Some(averaging::follow(average, net, decay, self.step));
         }
 
         Ok(LogLine {
             step: self.step,
             epoch,
             lr,
-            loss: value,
-            terms: terms.values(),
-            gradient: norm,
+            loss: found.loss,
+            terms: found.terms,
+            gradient: found.gradient,
             seconds: started.elapsed().as_secs_f64(),
             waited: 0.0,
             frames: batch.names,
@@ -351,7 +336,8 @@ impl Trainer {
             ssim += terms.ssim;
             l1 += terms.l1;
             census += terms.census.unwrap_or(0.0);
-            self.number(self.step, "the photometric loss", ssim + l1, &frame.name)?;
+            number("the photometric loss", ssim + l1)
+                .map_err(|e| e.error(self.step, &frame.name))?;
             if let Some(truth) = &truth {
                 let (width, height) = frame.left.dimensions();
                 errors.add(&to_plane(&disparity, width, height), truth);
@@ -385,33 +371,17 @@ impl Trainer {
         self.step.is_multiple_of(every)
     }
 
-    /// Refuses a value that is no number, and names the frames behind it.
-    fn number(
-        &self,
-        step: usize,
-        what: &'static str,
-        value: f32,
-        frames: &str,
-    ) -> Result<(), TrainError> {
-        if value.is_finite() {
-            return Ok(());
-        }
-        Err(TrainError::NotFinite {
-            step,
-            what,
-            value,
-            frames: frames.to_owned(),
-        })
-    }
-
     /// Saves what is needed to go on, unless `frames` (the last batch) spoiled the weights.
     fn checkpoint(&mut self, frames: &str) -> Result<(), TrainError> {
-        let length = gradients::norm(&self.net);
-        self.number(self.step, "the length of the weights", length, frames)?;
+        number(
+            "the length of the weights",
+            gradients::norm(&self.descent.net),
+        )
+        .map_err(|e| e.error(self.step, frames))?;
         let saved = Saved {
-            net: self.net.clone(),
+            net: self.descent.net.clone(),
             average: self.average.clone(),
-            optimizer: self.optimizer.clone(),
+            optimizer: self.descent.optimizer.clone(),
         };
         self.run
             .checkpoint(self.step, &saved, &self.net(), &self.state)?;

@@ -362,13 +362,16 @@ impl Ops for GraphWriter {
         &mut self,
         name: &str,
         shares: usize,
+        reach: usize,
         weights: &String,
         x: &String,
     ) -> String {
-        let around = Kernel::from_fn([NEIGHBOURS * shares, 1, 3, 3], |c, _, row, column| {
-            f32::from(c / shares == 3 * row + column)
+        let side = 2 * reach + 1;
+        let around = Kernel::from_fn([NEIGHBOURS * shares, 1, side, side], |c, _, y, x| {
+            let n = c / shares;
+            f32::from((y, x) == (reach * (n / 3), reach * (n % 3)))
         });
-        let padded = self.pad_edge([1; 4], x);
+        let padded = self.pad_edge([reach; 4], x);
         let around = self.fixed_conv2d(&format!("{name}.around"), &around, 1, &padded);
         let weighted = self.mul(weights, &around);
         self.sum_neighbours(&format!("{name}.mix"), shares, &weighted)

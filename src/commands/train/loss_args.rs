@@ -35,6 +35,9 @@ pub struct LossArgs {
     /// Weight of the distance to disparity by semi-global matching, where that is sure and better (try 0.01) [default: 0]
     #[arg(long, value_name = "W")]
     proxies: Option<f32>,
+    /// Weight of the cross-entropy of the distribution over disparities; with --supervised (try 10) [default: 0]
+    #[arg(long, value_name = "W")]
+    distribution: Option<f32>,
 }
 
 impl LossArgs {
@@ -48,6 +51,7 @@ impl LossArgs {
             (&mut loss.second_order, self.second_order),
             (&mut loss.census, self.census),
             (&mut loss.proxies, self.proxies),
+            (&mut loss.distribution, self.distribution),
         ];
         for (weight, flag) in weights {
             *weight = flag.unwrap_or(*weight);

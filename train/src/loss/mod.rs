@@ -21,7 +21,7 @@ mod photometric;
 mod smoothness;
 
 pub use census::census_distance;
-pub use known::{smooth_l1, supervised};
+pub use known::{cross_entropy, smooth_l1, supervised};
 pub use neighbour::{Neighbour, projection};
 pub use occlusion::visible;
 pub use photometric::{structural_dissimilarity, warp_right_to_left};
@@ -29,7 +29,7 @@ pub use smoothness::{edge_aware_smoothness, second_order_smoothness};
 
 use std::fmt::{Display, Formatter};
 
-use barchan_model::StereoNet;
+use barchan_model::{Argmin, StereoNet};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use burn::tensor::ops::PadMode;
@@ -67,6 +67,9 @@ pub struct Loss {
     /// it explains the image better than the network does. In pixels, where the other terms are shares:
     /// 0.01 helps, 0.1 already binds the network to the matcher's errors.
     pub proxies: f32,
+    /// Weight of the cross-entropy of the distribution ([`cross_entropy`]) beside eq. 8, for supervised training. The mean
+    /// is then taken around the peak, as at inference.
+    pub distribution: f32,
 }
 
 impl Default for Loss {
@@ -82,6 +85,7 @@ impl Default for Loss {
             symmetric: false,
             neighbours: 0,
             proxies: 0.0,
+            distribution: 0.0,
         }
     }
 }
@@ -124,6 +128,8 @@ pub struct View {
     pub right: Tensor<4>,
     /// Disparity of `left`.
     pub disparity: Tensor<4>,
+    /// The distribution that it is the mean of, where it is known.
+    pub logits: Option<Tensor<4>>,
     /// Disparity of `right`, for the left-right check.
     pub right_disparity: Option<Tensor<4>>,
     /// Images of other times.
@@ -139,6 +145,7 @@ impl View {
             left,
             right,
             disparity,
+            logits: None,
             right_disparity: None,
             neighbours: vec![],
             proxies: None,
@@ -151,20 +158,22 @@ impl View {
     /// symmetric.
     pub(crate) fn predict(net: &StereoNet, batch: &Batch, loss: &Loss) -> (Self, Option<Self>) {
         let (left, right) = (&batch.seen_left, &batch.seen_right);
-        let (disparity, mirrored) = if loss.symmetric {
+        let argmin = match loss.distribution > 0.0 {
+            true => Argmin::AroundPeak,
+            false => Argmin::Everywhere,
+        };
+        let (disparity, logits, mirrored) = if loss.symmetric {
             let both = |a: &Tensor<4>, b: &Tensor<4>| Tensor::cat(vec![a.clone(), mirror(b)], 0);
-            let prediction = net.forward_training(both(left, right), both(right, left));
+            let prediction = net.forward_training(argmin, &both(left, right), &both(right, left));
             let halves = prediction.disparity.chunk(2, 0);
-            (halves[0].clone(), Some(halves[1].clone()))
+            (halves[0].clone(), None, Some(halves[1].clone()))
         } else {
             let mirrored = loss.occlusion.map(|_| {
                 let [left, right] = [right, left].map(|image| mirror(image).inner());
                 Tensor::from_inner(net.valid().forward(left, right).disparity)
             });
-            (
-                net.forward_training(left.clone(), right.clone()).disparity,
-                mirrored,
-            )
+            let prediction = net.forward_training(argmin, left, right);
+            (prediction.disparity, Some(prediction.logits), mirrored)
         };
         let right_disparity = mirrored.as_ref().filter(|_| loss.occlusion.is_some());
         let view = Self {
@@ -174,6 +183,7 @@ impl View {
             neighbours: batch.neighbours.clone(),
             proxies: batch.proxies.clone(),
             disparity,
+            logits,
         };
         let other = mirrored.filter(|_| loss.symmetric).map(|mirrored| Self {
             right_disparity: loss.occlusion.map(|_| mirror(&view.disparity)),
@@ -208,6 +218,7 @@ impl Loss {
             ("second_order", self.second_order),
             ("census", self.census),
             ("proxies", self.proxies),
+            ("distribution", self.distribution),
             ("occlusion", self.occlusion.unwrap_or(0.0)),
         ];
         for (name, weight) in weights {
@@ -217,6 +228,11 @@ impl Loss {
                 )));
             }
         }
+        if !supervised && self.distribution > 0.0 {
+            return Err(TrainError::Config(
+                "loss: distribution has no effect without true disparity\n  cure: add --supervised, or leave it away".into(),
+            ));
+        }
         let costly =
             self.occlusion.is_some() || self.symmetric || self.neighbours > 0 || self.proxies > 0.0;
         if supervised && costly {
@@ -225,6 +241,22 @@ impl Loss {
             ));
         }
         Ok(())
+    }
+
+    /// Eq. 8, with the cross-entropy of the distribution where that is asked for.
+    pub fn supervised(&self, view: &View, truth: &Tensor<4>, known: &Tensor<4>) -> Tensor<1> {
+        let loss = supervised(&view.disparity, truth, known);
+        match &view.logits {
+            Some(logits) if self.distribution > 0.0 => {
+                loss + cross_entropy(logits, truth, known) * self.distribution
+            }
+            _ => loss,
+        }
+    }
+
+    /// The photometric part, `a1 L_SSIM + a2 L_1` and the weighted census term where that is on.
+    pub fn photometric(&self, terms: &LossTerms) -> f32 {
+        self.ssim * terms.ssim + self.l1 * terms.l1 + self.census * terms.census.unwrap_or(0.0)
     }
 
     /// Eq. 1 with its options, the mean of the views that are given; and its terms.

@@ -20,6 +20,7 @@ const NOTHING: Loss = Loss {
     symmetric: false,
     neighbours: 0,
     proxies: 0.0,
+    distribution: 0.0,
 };
 
 fn view(disparity: &Tensor<4>) -> View {
