@@ -21,13 +21,15 @@ TORCH = $(CACHE)/libtorch/2.9.1
 # What `make run` works on, and where it writes.
 DATA = synth:seed=1,frames=40
 OUT  = runs/demo
+# What `make accuracy` judges.
+MODEL = rover
 
 PEERS := $(CACHE)/peers-$(shell sha256sum tests/peers/requirements.txt | cut -c 1-12)
 TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/libtorch.py
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch peers peers-torch onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch peers accuracy peers-torch onnxruntime libtorch sample-data clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -70,6 +72,9 @@ $(PEERS)/ready: tests/peers/requirements.txt
 	$(PYTHON) -m venv --clear $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --no-deps --only-binary :all: --requirement $<
 	touch $@
+
+accuracy: build onnxruntime $(PEERS)/ready ## MODEL=rover on pairs it never saw, beside OpenCV's SGBM; 100 rendered seeds (5 minutes)
+	$(PEERS)/bin/python tests/peers/accuracy.py --barchan "$(BARCHAN)" --model "$(MODEL)"
 
 peers-torch: build onnxruntime $(PEERS_TORCH)/ready ## the network in pure PyTorch: weights both ways, gradients, time of a step (1 GB to fetch)
 	$(PEERS_TORCH)/bin/python tests/peers/run_torch.py --barchan "$(BARCHAN)"

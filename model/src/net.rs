@@ -46,6 +46,7 @@ impl Preset {
                 }),
                 up_sampling: 16,
                 refinement: 0,
+                spread: as_stated(),
             },
             Self::Rover => NetConfig {
                 max_disparity: 96,
@@ -58,6 +59,7 @@ impl Preset {
                 }),
                 up_sampling: 32,
                 refinement: 48,
+                spread: as_stated(),
             },
             Self::Paper => NetConfig {
                 max_disparity: 96,
@@ -69,6 +71,7 @@ impl Preset {
                 }),
                 up_sampling: 32,
                 refinement: 48,
+                spread: as_stated(),
             },
         }
     }
@@ -84,7 +87,7 @@ impl Preset {
 }
 
 /// Everything that shapes a network; stored with its weights.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetConfig {
     /// Disparities are searched in `0..max_disparity` pixels; a multiple of 16.
@@ -96,8 +99,17 @@ pub struct NetConfig {
     /// Hidden channels of the refinement before it; 0 is none.
     #[serde(default)]
     pub refinement: usize,
+    /// `[a, b]`: `a v + b v^2` is the variance of the error where the distribution says `v`, in bins squared. Fitted to
+    /// true disparity at the end of supervised training; as stated where not.
+    #[serde(default = "as_stated")]
+    pub spread: [f32; 2],
     /// How costs become logits.
     pub aggregation: AggregationConfig,
+}
+
+/// The variance of the distribution as that of the error.
+fn as_stated() -> [f32; 2] {
+    [1.0, 0.0]
 }
 
 /// From features to logits over disparities.
@@ -143,6 +155,11 @@ impl NetConfig {
                 channels.extend(&c.channels);
                 channels.push(c.matching);
             }
+        }
+        if !(self.spread.iter().all(|v| v.is_finite() && *v >= 0.0) && self.spread[0] > 0.0) {
+            return refuse(
+                "spread must be two numbers, the first above zero, the second not below",
+            );
         }
         if channels.iter().any(|c| !(1..=1024).contains(c)) {
             return refuse("channels and groups must be 1 to 1024");
@@ -241,6 +258,16 @@ impl StereoNet {
         Ok(self)
     }
 
+    /// The same weights, with another [`NetConfig::spread`].
+    ///
+    /// # Errors
+    /// When it is refused.
+    pub fn with_spread(mut self, spread: Option<[f32; 2]>) -> Result<Self, ModelError> {
+        self.config.spread = spread.unwrap_or_else(as_stated);
+        self.config.check()?;
+        Ok(self)
+    }
+
     /// The configuration.
     pub fn config(&self) -> &NetConfig {
         &self.config
@@ -304,11 +331,27 @@ impl StereoNet {
             &context,
             self.refinement.as_ref(),
         );
+        let sigma = self.calibrated(ops, full.sigma);
         Prediction {
             logits: full.logits,
             disparity: ops.crop_to(left, &full.disparity),
-            sigma: ops.crop_to(left, &full.sigma),
+            sigma: ops.crop_to(left, &sigma),
             confidence: ops.crop_to(left, &full.confidence),
         }
+    }
+
+    /// `sigma` in pixels as [`NetConfig::spread`] corrects it.
+    fn calibrated<O: Ops>(&self, ops: &mut O, sigma: O::Map) -> O::Map {
+        let spread = self.config.spread;
+        if spread == as_stated() {
+            return sigma;
+        }
+        let [a, b] = spread;
+        let bins = ops.affine(1.0 / SCALE as f32, 0.0, &sigma);
+        let variance = ops.mul(&bins, &bins);
+        let factor = ops.affine(b, a, &variance);
+        let variance = ops.mul(&variance, &factor);
+        let sigma = ops.sqrt(&variance);
+        ops.affine(SCALE as f32, 0.0, &sigma)
     }
 }

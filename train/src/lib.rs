@@ -25,6 +25,7 @@ pub mod loss;
 mod pool;
 mod run_dir;
 mod schedule;
+mod spread;
 mod trainer;
 mod validation;
 

@@ -140,6 +140,14 @@ impl RunDir {
             .map_err(|e| self.error("log.jsonl", e))
     }
 
+    /// Writes `weights.safetensors` anew.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub(crate) fn weights(&self, net: &StereoNet) -> Result<(), TrainError> {
+        Ok(weights::save(net, &self.path("weights.safetensors"))?)
+    }
+
     /// Writes `summary.json`.
     ///
     /// # Errors
@@ -196,7 +204,7 @@ impl RunDir {
             .map_err(|e| failed(&e))?;
         let state = serde_json::to_vec(state).map_err(|e| failed(&e))?;
         std::fs::write(part.join("state.json"), state).map_err(|e| failed(&e))?;
-        weights::save(net, &self.path("weights.safetensors"))?;
+        self.weights(net)?;
         std::fs::rename(&part, &done).map_err(|e| failed(&e))?;
         for old in self.checkpoints()?.into_iter().filter(|s| *s < step) {
             std::fs::remove_dir_all(self.path(&format!("checkpoints/{old:08}")))

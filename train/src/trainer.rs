@@ -2,7 +2,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use barchan_datasets::{Prefetch, StereoSource};
-use barchan_model::{Device, StereoNet};
+use barchan_model::{Device, SCALE, StereoNet};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use rand::SeedableRng;
@@ -17,7 +17,7 @@ use crate::pool::Pool;
 use crate::run_dir::Saved;
 use crate::validation::{Errors, to_plane};
 use crate::{Batch, Explained, LogLine, RunDir, Scored, TrainConfig, TrainError, Validation};
-use crate::{averaging, gradients};
+use crate::{averaging, gradients, spread};
 
 /// Who watches a run: told of what happens, and asked whether to go on.
 pub trait Observer {
@@ -240,6 +240,9 @@ impl Trainer {
                 }
             }
         }
+        if self.config.supervised && !self.fit_spread(observer)? {
+            return self.stopped();
+        }
         let Some(after) = self.assess(observer)? else {
             return self.stopped();
         };
@@ -291,6 +294,43 @@ impl Trainer {
             waited: 0.0,
             frames: batch.names,
         })
+    }
+
+    /// Makes the network's sigma as large as its errors on held-out pairs, and saves the weights with that;
+    /// `false` when the observer stops it on the way.
+    fn fit_spread(&mut self, observer: &mut dyn Observer) -> Result<bool, TrainError> {
+        /// One pixel in so many is enough.
+        const EVERY: usize = 7;
+        let net = self.net().with_spread(None)?;
+        let device = self.device.clone().inner();
+        let mut found = vec![];
+        for sample in self.pool.whole(self.held_out.clone()) {
+            let (frame, truth) = sample?;
+            let Some(truth) = truth else { continue };
+            let (width, height) = frame.left.dimensions();
+            let [left, right]: [Tensor<4>; 2] = Batch::whole(&frame, &device);
+            let prediction = net.forward(left, right);
+            let [disparity, sigma] =
+                [prediction.disparity, prediction.sigma].map(|t| to_plane(&t, width, height));
+            let most = (self.config.net.max_disparity - 2) as f32;
+            let pixels = disparity.iter().zip(sigma.iter()).zip(truth.iter());
+            let reachable = pixels.filter(|(_, truth)| **truth <= most).step_by(EVERY);
+            let in_bins = |v: f32| (v / SCALE as f32).powi(2);
+            found.extend(reachable.map(|((d, s), truth)| (in_bins(d - truth), in_bins(*s))));
+            if observer.stop() {
+                return Ok(false);
+            }
+        }
+        if let Some(fitted) = spread::fit(found) {
+            let net = self.descent.net.clone();
+            self.descent.net = net.with_spread(Some(fitted))?;
+            self.average = match self.average.take() {
+                Some(average) => Some(average.with_spread(Some(fitted))?),
+                None => None,
+            };
+            self.run.weights(&self.net())?;
+        }
+        Ok(true)
     }
 
     /// Looks at the held-out pairs, writes down what it found and tells the observer; `None` when that
