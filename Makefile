@@ -29,7 +29,7 @@ TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/li
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch peers accuracy peers-torch onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch weights peers accuracy peers-torch onnxruntime libtorch sample-data clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -72,6 +72,9 @@ $(PEERS)/ready: tests/peers/requirements.txt
 	$(PYTHON) -m venv --clear $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --no-deps --only-binary :all: --requirement $<
 	touch $@
+
+weights: build onnxruntime ## the weights of rover from nothing, into runs/weights; hours; after a stop it goes on
+	scripts/weights.sh "$(BARCHAN)" runs/weights
 
 accuracy: build onnxruntime $(PEERS)/ready ## MODEL=rover on pairs it never saw, beside OpenCV's SGBM; 100 rendered seeds (5 minutes)
 	$(PEERS)/bin/python tests/peers/accuracy.py --barchan "$(BARCHAN)" --model "$(MODEL)"

@@ -8,7 +8,10 @@ use barchan_model::{Device, StereoNet, weights};
 use barchan_train::RunDir;
 
 /// Weights that are part of this program.
-const SHIPPED: [(&str, &[u8]); 1] = [("tiny", include_bytes!("../checkpoints/tiny.safetensors"))];
+const SHIPPED: [(&str, &[u8]); 2] = [
+    ("rover", include_bytes!("../checkpoints/rover.safetensors")),
+    ("tiny", include_bytes!("../checkpoints/tiny.safetensors")),
+];
 
 /// The network of a shipped name, a safetensors file, or a run directory of `barchan train`; with
 /// `:192` after it, searching 192 disparities.

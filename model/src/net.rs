@@ -99,17 +99,17 @@ pub struct NetConfig {
     /// Hidden channels of the refinement before it; 0 is none.
     #[serde(default)]
     pub refinement: usize,
-    /// `[a, b]`: `a v + b v^2` is the variance of the error where the distribution says `v`, in bins squared. Fitted to
-    /// true disparity at the end of supervised training; as stated where not.
+    /// `[c, a, b]`: `c + a v + b v^2` is the variance of the error where the distribution says `v`, in bins squared. Fitted
+    /// to true disparity at the end of supervised training; as stated where not.
     #[serde(default = "as_stated")]
-    pub spread: [f32; 2],
+    pub spread: [f32; 3],
     /// How costs become logits.
     pub aggregation: AggregationConfig,
 }
 
 /// The variance of the distribution as that of the error.
-fn as_stated() -> [f32; 2] {
-    [1.0, 0.0]
+fn as_stated() -> [f32; 3] {
+    [0.0, 1.0, 0.0]
 }
 
 /// From features to logits over disparities.
@@ -156,10 +156,8 @@ impl NetConfig {
                 channels.push(c.matching);
             }
         }
-        if !(self.spread.iter().all(|v| v.is_finite() && *v >= 0.0) && self.spread[0] > 0.0) {
-            return refuse(
-                "spread must be two numbers, the first above zero, the second not below",
-            );
+        if !(self.spread.iter().all(|v| v.is_finite() && *v >= 0.0) && self.spread[1] > 0.0) {
+            return refuse("spread must be three numbers not below zero, the second above it");
         }
         if channels.iter().any(|c| !(1..=1024).contains(c)) {
             return refuse("channels and groups must be 1 to 1024");
@@ -262,7 +260,7 @@ impl StereoNet {
     ///
     /// # Errors
     /// When it is refused.
-    pub fn with_spread(mut self, spread: Option<[f32; 2]>) -> Result<Self, ModelError> {
+    pub fn with_spread(mut self, spread: Option<[f32; 3]>) -> Result<Self, ModelError> {
         self.config.spread = spread.unwrap_or_else(as_stated);
         self.config.check()?;
         Ok(self)
@@ -346,11 +344,12 @@ impl StereoNet {
         if spread == as_stated() {
             return sigma;
         }
-        let [a, b] = spread;
+        let [c, a, b] = spread;
         let bins = ops.affine(1.0 / SCALE as f32, 0.0, &sigma);
         let variance = ops.mul(&bins, &bins);
         let factor = ops.affine(b, a, &variance);
         let variance = ops.mul(&variance, &factor);
+        let variance = ops.affine(1.0, c, &variance);
         let sigma = ops.sqrt(&variance);
         ops.affine(SCALE as f32, 0.0, &sigma)
     }

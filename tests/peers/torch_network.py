@@ -68,7 +68,7 @@ class StereoNet(nn.Module):
         self.features = Features(channels)
         (kind, aggregation), = config["aggregation"].items()
         self.aggregation = {"planar": Planar, "volumetric": Volumetric}[kind](aggregation, channels)
-        self.spread = config.get("spread", [1, 0])
+        self.spread = config.get("spread", [0, 1, 0])
         hidden = config.get("refinement", 0)
         self.refinement = Refinement(channels[1], hidden) if hidden else None
         self.regression = Regression(channels[1], config["up_sampling"])
@@ -82,9 +82,9 @@ class StereoNet(nn.Module):
         logits = self.aggregation(quarter.chunk(2), eighth.chunk(2), images.chunk(2), self.bins)
         full = self.regression(logits, quarter.chunk(2)[0], self.refinement)
         disparity, sigma, confidence = (x[:, :, :height, :width] for x in full)
-        a, b = self.spread
+        c, a, b = self.spread
         variance = (sigma / SCALE) ** 2
-        return disparity, SCALE * (a * variance + b * variance**2).sqrt(), confidence
+        return disparity, SCALE * (c + a * variance + b * variance**2).sqrt(), confidence
 
 
 class Features(nn.Module):

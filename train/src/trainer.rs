@@ -300,7 +300,7 @@ impl Trainer {
     /// `false` when the observer stops it on the way.
     fn fit_spread(&mut self, observer: &mut dyn Observer) -> Result<bool, TrainError> {
         /// One pixel in so many is enough.
-        const EVERY: usize = 7;
+        const EVERY: usize = 17;
         let net = self.net().with_spread(None)?;
         let device = self.device.clone().inner();
         let mut found = vec![];
