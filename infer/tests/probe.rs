@@ -35,7 +35,7 @@ fn verdict(path: &std::path::Path) -> Result<Verdict, InferError> {
 /// Median error of an engine on a scene that the probe has not seen, pixels, over what both cameras see
 /// within an eighth of the width.
 fn median_error(engine: &mut OnnxEngine, width: u32, height: u32) -> f32 {
-    let spec = format!("synth:scenes,seed=23,frames=1,width={width},height={height}");
+    let spec = format!("synth:scenes,seed=23,frames=1,clutter=0,width={width},height={height}");
     let source = open(&spec).unwrap();
     let frame = source.frame(0).unwrap();
     let truth = source.true_disparity(0).unwrap().unwrap();
@@ -267,7 +267,7 @@ fn what_a_fixed_model_says_is_judged_by_the_pair() {
         assert!(map.sigma.iter().all(|s| (0.0..=8.0).contains(s)));
     }
     // Errors above a pixel are rarer where the confidence is high.
-    let source = open("synth:scenes,seed=29,frames=1,width=192,height=128").unwrap();
+    let source = open("synth:scenes,seed=29,frames=1,clutter=0,width=192,height=128").unwrap();
     let frame = source.frame(0).unwrap();
     let truth = source.true_disparity(0).unwrap().unwrap();
     let map = engine.disparity(&frame.left, &frame.right).unwrap();

@@ -34,7 +34,8 @@ gain=0            how much brighter the right camera is, as a share
 dust=0            specks of dust on each lens
 rectified=true    false: images of a distorted, crooked rig, rectified on reading
 sensor_noise=true false: IMU, odometry and GNSS without noise and bias
-synth:scenes      random shapes instead of a traverse: seed, frames, width, height, baseline, noise";
+synth:scenes      random shapes instead of a traverse: seed, frames, width, height, baseline, noise,
+                  and clutter=1, 0 for a few large things with rich texture";
 
 /// How a place looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -92,6 +93,8 @@ pub(super) struct Options {
     pub camera: CameraOptions,
     pub rectified: bool,
     pub sensor_noise: bool,
+    /// Of random scenes: 0 for a few large things with rich texture, 1 for all there is.
+    pub clutter: f64,
 }
 
 /// What the cameras do to the light; see [`OPTIONS`].
@@ -142,6 +145,7 @@ impl Default for Options {
             },
             rectified: true,
             sensor_noise: true,
+            clutter: 1.0,
         }
     }
 }
@@ -156,10 +160,14 @@ impl Options {
         for item in spec.split(',').map(str::trim).filter(|i| !i.is_empty()) {
             let (key, value) = item.split_once('=').unwrap_or((item, ""));
             let reader = Reader { spec, key, value };
-            let known = options.set_common(&reader)? || (!scenes && options.set_rover(&reader)?);
+            let known = options.set_common(&reader)?
+                || match scenes {
+                    true => options.set_scenes(&reader)?,
+                    false => options.set_rover(&reader)?,
+                };
             if !known {
                 let keys = if scenes {
-                    COMMON.join(", ")
+                    format!("{}, clutter", COMMON.join(", "))
                 } else {
                     format!("{}, {}", COMMON.join(", "), ROVER.join(", "))
                 };
@@ -182,6 +190,14 @@ impl Options {
             "height" => self.height = read.within(32, 4096, "a whole number")?,
             "baseline" => self.baseline = read.within(0.01, 2.0, "metres")?,
             "noise" => self.camera.noise = read.within(0.0, 50.0, "grey levels")?,
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    fn set_scenes(&mut self, read: &Reader) -> Result<bool, DataError> {
+        match read.key {
+            "clutter" => self.clutter = read.within(0.0, 1.0, "a number")?,
             _ => return Ok(false),
         }
         Ok(true)

@@ -31,6 +31,8 @@ pub struct RandomScenes {
 /// Side of the materials' textures.
 const TEXELS: usize = 256;
 const MATERIALS: usize = 48;
+/// One material in so many is leaves upon leaves.
+const LEAVES: usize = 3;
 
 impl RandomScenes {
     /// Reads `seed=1,frames=60,width=384,height=288,baseline=0.12,noise=1`, each optional.
@@ -59,7 +61,8 @@ impl RandomScenes {
         }
         let mut rng = ChaCha8Rng::seed_from_u64(self.options.seed);
         rng.set_stream(index as u64);
-        let shapes = Shapes::random(&self.rig, &self.materials, &mut rng);
+        let clutter = self.options.clutter;
+        let shapes = Shapes::random(&self.rig, &self.materials, clutter, &mut rng);
         Ok((shapes, rng))
     }
 
@@ -287,6 +290,8 @@ struct Stage<'a> {
     nearest: f64,
     /// How far below the cameras the floor is, where there is one.
     floor: Option<f64>,
+    /// As [`Options::clutter`].
+    clutter: f64,
     rng: &'a mut ChaCha8Rng,
 }
 
@@ -327,19 +332,27 @@ impl Stage<'_> {
         let rng = &mut *self.rng;
         let bright = rng.random_range(0.15..1.2f32);
         // Half of the shapes are all but grey.
-        let colourful = if rng.random_bool(0.5) { 0.4 } else { 0.06 };
+        let colourful = if rng.random_bool(0.5 * self.clutter) {
+            0.06
+        } else {
+            0.4
+        };
         Shape {
             body,
             centre,
             radius,
             axes: axes.to_rotation_matrix().into_inner(),
-            material: rng.random_range(0..MATERIALS),
+            material: match rng.random_range(0..MATERIALS) {
+                // Leaves, which have texture everywhere.
+                any if self.clutter == 0.0 => any - any % LEAVES,
+                any => any,
+            },
             // A texel is a quarter of a pixel up to four, seen at the shape's depth.
             texel: centre.z.max(0.5) / self.rig.fx * 4f64.powf(rng.random_range(-1.0..1.0)),
             // Every sixth is nearly uniform.
-            contrast: match rng.random_bool(0.17) {
+            contrast: match rng.random_bool(0.17 * self.clutter) {
                 true => rng.random_range(0.02..0.2),
-                false => rng.random_range(0.35..1.0),
+                false => rng.random_range(1.0 - 0.65 * self.clutter as f32..1.01),
             },
             tint: Vector3::from_fn(|_, _| bright * rng.random_range(1.0 - colourful..1.0)),
         }
@@ -350,7 +363,9 @@ impl Stage<'_> {
         let mut centre = self.place();
         let z = centre.z;
         // Small ones are as many as large ones at each doubling.
-        let pixels = self.rig.width as f64 * 0.24 * 12f64.powf(self.rng.random_range(-1.0..0.0));
+        let pixels = self.rig.width as f64
+            * 0.24
+            * (4.0 + 8.0 * self.clutter).powf(self.rng.random_range(-1.0..0.0));
         let size = self.pixels(z, pixels);
         let [a, b, c] = std::array::from_fn(|_| size * self.rng.random_range(0.4..1.0));
         if let Some(floor) = self.floor
@@ -444,7 +459,13 @@ impl Stage<'_> {
 }
 
 impl<'a> Shapes<'a> {
-    fn random(rig: &RectifiedRig, materials: &'a [Texture<3>], rng: &mut ChaCha8Rng) -> Self {
+    fn random(
+        rig: &RectifiedRig,
+        materials: &'a [Texture<3>],
+        clutter: f64,
+        rng: &mut ChaCha8Rng,
+    ) -> Self {
+        let most = |least: u32, all: u32| least + (f64::from(all - least) * clutter).round() as u32;
         // Depths by disparity: the wall at 0.5 to 6 % of the width, shapes up to 28 %.
         let depth = |share: f64| rig.fx * rig.baseline / (share * rig.width as f64);
         let wall = depth(0.005 * 12f64.powf(rng.random_range(0.0..1.0)));
@@ -455,12 +476,13 @@ impl<'a> Shapes<'a> {
             wall,
             nearest: depth(0.28),
             floor,
+            clutter,
             rng,
         };
 
         let mut shapes = Vec::new();
         // Walls without end meet in corners.
-        for k in 0..stage.rng.random_range(1..4) {
+        for k in 0..stage.rng.random_range(1..most(2, 4)) {
             let away = if k == 0 {
                 1.0
             } else {
@@ -474,13 +496,13 @@ impl<'a> Shapes<'a> {
             let axes = stage.turn(0.15) * UnitQuaternion::from_rotation_matrix(&level);
             shapes.push(stage.paint(Body::Plane, Vector3::new(0.0, floor, wall / 2.0), axes));
         }
-        for _ in 0..stage.rng.random_range(5..40) {
+        for _ in 0..stage.rng.random_range(5..most(9, 40)) {
             shapes.push(stage.single());
         }
-        for _ in 0..stage.rng.random_range(0..3) {
+        for _ in 0..stage.rng.random_range(0..most(1, 3)) {
             shapes.extend(stage.fence());
         }
-        for _ in 0..stage.rng.random_range(0..4) {
+        for _ in 0..stage.rng.random_range(0..most(1, 4)) {
             shapes.extend(stage.twig());
         }
         let to_lamp = Vector3::new(
@@ -547,10 +569,10 @@ impl Scene for Shapes<'_> {
 /// nothing, in two colours; and every third time leaves upon leaves.
 fn material(kind: usize, seed: u32) -> Texture<3> {
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(seed));
-    if kind.is_multiple_of(3) {
+    if kind.is_multiple_of(LEAVES) {
         return Texture::new(TEXELS, true, fallen_leaves(&mut rng));
     }
-    let kind = kind / 3 * 2 + kind % 3 - 1;
+    let kind = kind - kind / LEAVES - 1;
     let waves: &[(u32, f32)] = match kind % 4 {
         0 => &[(4, 1.2), (9, 1.2), (19, 1.2), (41, 1.2), (85, 1.2)],
         1 => &[(60, 2.0), (100, 2.0)],
