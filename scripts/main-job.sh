@@ -13,7 +13,7 @@ step() { # step TITLE ARGUMENTS...: one command of barchan, as anybody could typ
 }
 
 mkdir -p "$out"
-rm -rf "$out"/{train,infer,slam,map,model.onnx}
+rm -rf "$out"/{train,infer,slam,map,model.onnx,report.html}
 
 # Rendered data go to disk first, so that the images can be looked at and the truth is a file.
 if [[ $data == synth:* || $data == synth ]]; then
@@ -28,16 +28,21 @@ step "Disparity" infer --data "$data" --model "$out/model.onnx" --out "$out/infe
 step "Trajectory" slam --data "$data" --model "$out/model.onnx" --out "$out/slam"
 step "Terrain" map "$out/slam" --out "$out/map"
 
+against=()
 for truth in groundtruth.tum gt.csv poses.txt; do
     if [[ -f ${data#folder:}/$truth ]]; then
         step "Trajectory against the truth" eval trajectory --est "$out/slam/trajectory.tum" --gt "${data#folder:}/$truth"
+        against=(--gt "${data#folder:}/$truth")
         break
     fi
 done
 
+step "Report" report "$out/slam" --map "$out/map" "${against[@]}" --out "$out/report.html"
+
 cat <<END
 
 Done. Where to look:
+  $out/report.html       everything on one page
   $out/infer             disparity, confidence, colour previews, a cloud of points per frame
   $out/slam              trajectory.tum, summary.json
   $out/map/cloud.ply     the ground in colour (CloudCompare, MeshLab)

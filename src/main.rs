@@ -20,9 +20,9 @@ use clap::{Parser, Subcommand};
     version,
     propagate_version = true,
     after_help = "A first run, with nothing but this program:\n  \
-        barchan data synth synth:seed=1,frames=40 --out data\n  \
-        barchan slam --data data --model tiny --out run\n  \
-        barchan map run --out map"
+        barchan demo --out demo\n\
+        and then with your images:\n  \
+        barchan demo --data folder:my_images --out day1"
 )]
 struct Cli {
     /// Print machine-readable JSON on standard output instead of tables.
@@ -37,6 +37,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Demo(commands::demo::Args),
     Train(Box<commands::train::Args>),
     Adapt(commands::adapt::Args),
     Export(commands::export::Args),
@@ -45,6 +46,7 @@ enum Command {
     Slam(commands::slam::Args),
     Map(commands::map::Args),
     Raster(commands::raster::Args),
+    Report(commands::report::Args),
     Eval(commands::eval::Args),
     Data(commands::data::Args),
     Doctor(commands::doctor::Args),
@@ -55,6 +57,7 @@ fn main() -> ExitCode {
     let output = output::Output { json: cli.json };
     let runtime = cli.onnxruntime.as_deref();
     let result = match cli.command {
+        Command::Demo(args) => commands::demo::run(args, &output, runtime),
         Command::Train(args) => match commands::train::run(*args, &output) {
             Ok(false) => return ExitCode::from(commands::train::INTERRUPTED),
             other => other.map(|_| ()),
@@ -66,6 +69,7 @@ fn main() -> ExitCode {
         Command::Slam(args) => commands::slam::run(args, &output, runtime),
         Command::Map(args) => commands::map::run(args, &output),
         Command::Raster(args) => commands::raster::run(args, &output),
+        Command::Report(args) => commands::report::run(args, &output),
         Command::Eval(args) => commands::eval::run(args, &output),
         Command::Data(args) => match commands::data::run(args, &output) {
             // A check that found something is no error, and scripts want to know.

@@ -107,7 +107,7 @@ fn trajectory(est: &Path, gt: &Path, tolerance: f64, output: &Output) -> Result<
 }
 
 /// By content: comma-separated with a header, twelve numbers a line (KITTI), or eight (TUM).
-fn read_trajectory(path: &Path) -> Result<Trajectory> {
+pub fn read_trajectory(path: &Path) -> Result<Trajectory> {
     let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let first = text
         .lines()

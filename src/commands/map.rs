@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, read_rgb};
-use barchan_geometry::{Rig, Trajectory};
+use barchan_geometry::{Rig, StampedPose, Trajectory};
 use barchan_terrain::{DenseKeyframe, MapConfig, map_keyframes};
 use clap::Parser;
 use serde::Serialize;
@@ -57,6 +57,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     config.limits.max_depth = args.max_depth;
     let out = StagedDir::new(&args.out, "summary.json")?;
 
+    let poses: Vec<StampedPose> = keyframes.iter().map(|k| k.pose).collect();
     let bar = output.progress("map", keyframes.len());
     let frames = keyframes.into_iter().map(|k| {
         bar.inc(1);
@@ -71,6 +72,14 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     map.cloud().write_ply(&out.path("cloud.ply")?)?;
     map.dem.write(&out.path("dem.tif")?)?;
     map.hillshade.write(&out.path("hillshade.tif")?)?;
+    let levelled = poses.into_iter().map(|pose| StampedPose {
+        T_world_cam: map.T_level_world * pose.T_world_cam,
+        ..pose
+    });
+    let route = Trajectory {
+        poses: levelled.collect(),
+    };
+    out.write("keyframes.tum", route.to_tum())?;
     let summary = Summary {
         keyframes: map.keyframes,
         points: map.points,
@@ -84,7 +93,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     out.write_json("summary.json", &summary)?;
     out.finish()?;
     let text = format!(
-        "{} key frames, {} points in {} voxels of {} m; DEM {} x {} cells of {} m ({:.1} x {:.1} m)\n{}: cloud.ply dem.tif hillshade.tif",
+        "{} key frames, {} points in {} voxels of {} m; DEM {} x {} cells of {} m ({:.1} x {:.1} m)\n{}: cloud.ply dem.tif hillshade.tif keyframes.tum",
         summary.keyframes,
         summary.points,
         summary.voxels,
@@ -103,7 +112,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
 struct KeyframeFiles {
     run: PathBuf,
     name: String,
-    pose: barchan_geometry::StampedPose,
+    pose: StampedPose,
 }
 
 impl KeyframeFiles {

@@ -2,6 +2,7 @@
 
 pub mod adapt;
 pub mod data;
+pub mod demo;
 pub mod doctor;
 pub mod eval;
 pub mod export;
@@ -9,5 +10,6 @@ pub mod infer;
 pub mod map;
 pub mod probe;
 pub mod raster;
+pub mod report;
 pub mod slam;
 pub mod train;

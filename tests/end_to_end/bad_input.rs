@@ -201,3 +201,14 @@ fn a_matcher_with_no_range() {
         assert!(!out.exists());
     }
 }
+
+#[test]
+fn a_report_of_what_is_no_run() {
+    let case = Case::new();
+    let message = refused(&["report", text(&case.data)]);
+    assert!(
+        message.contains("trajectory.tum") && message.contains("barchan slam"),
+        "{message}"
+    );
+    assert!(!case.data.join("report.html").exists());
+}

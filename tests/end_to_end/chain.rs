@@ -141,3 +141,42 @@ fn images_become_terrain() {
     let read = |path: &Path| barchan_terrain::Raster::<u8>::read(path).unwrap().values;
     assert_eq!(read(&map.join("hillshade.tif")), read(&again));
 }
+
+#[test]
+fn a_demo_on_ones_own_images_ends_in_a_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = rendered(dir.path(), 8);
+    let out = dir.path().join("demo");
+    let said = barchan()
+        .args(["demo", "--data", text(&data), "--out", text(&out)])
+        .assert()
+        .success();
+    let said = String::from_utf8_lossy(&said.get_output().stdout).into_owned();
+    // Every step is a command that can be typed, and the images are offered to the network.
+    for command in ["slam --data", "map", "report", "train --finetune"] {
+        assert!(
+            said.contains(&format!("barchan {command}")),
+            "{command}: {said}"
+        );
+    }
+    exists(
+        &out,
+        &["slam/trajectory.tum", "map/cloud.ply", "report.html"],
+    );
+    let page = std::fs::read_to_string(out.join("report.html")).unwrap();
+    for part in ["<svg", "id=\"cloud\"", "id=\"relief\"", "data:image/jpeg"] {
+        assert!(page.contains(part), "{part}");
+    }
+
+    // The same folder again, with what is known of the truth.
+    let again = json(&[
+        "report",
+        text(&out),
+        "--gt",
+        text(&data.join("groundtruth.tum")),
+        "--out",
+        text(&dir.path().join("again.html")),
+    ]);
+    let again = std::fs::read_to_string(again["out"].as_str().unwrap()).unwrap();
+    assert!(again.contains("error of the route"));
+}

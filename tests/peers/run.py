@@ -1,7 +1,7 @@
 """barchan's outputs against programs nobody here wrote. `make peers` runs this.
 
 Trains for a moment on a rendered traverse, exports, infers, tracks and maps, and holds every file
-against ONNX Runtime, onnx, evo, GDAL, OpenCV and plyfile. Real images and published trajectories
+against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile and a browser. Real images and published trajectories
 join where ../shared/data has them. Exits 1 when a figure is out of bounds or a check fails to run.
 """
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import files
 import matching
 import network
+import page
 import rasters
 import speed
 import trajectory
@@ -70,10 +71,13 @@ def main() -> None:
         files.check_cloud(table, work / "slam" / "map.ply")
         files.check_cloud(table, work / "map" / "cloud.ply")
 
+    def browser(table: Table) -> None:
+        page.check(table, barchan, work / "slam", work / "map", work)
+
     def timings(table: Table) -> None:
         speed.report(barchan, work)
 
-    Table().run([prepare, exported, engines, matchers, trajectories, terrain, formats, timings])
+    Table().run([prepare, exported, engines, matchers, trajectories, terrain, formats, browser, timings])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,133 @@
+//! A run as one HTML file that needs no network: figures, charts, pictures, a cloud that turns, a relief that tells
+//! heights.
+//!
+//! What it is for: a [`Report`] is filled by whoever knows what a run holds, and [`Report::html`] makes the page.
+//!
+//! What it promises: everything is inside the file; text is escaped, whatever names the data has; the size is
+//! bounded (at most [`MAX_POINTS`] points, [`MAX_CELLS`] cells and [`MAX_SAMPLES`] marks a line), and the page says where that
+//! left something out.
+//!
+//! What it never does: read runs, or judge them.
+
+mod chart;
+mod cloud;
+mod relief;
+
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use image::{ImageFormat, RgbImage};
+use minijinja::value::Serde;
+use minijinja::{AutoEscape, Environment};
+use serde::Serialize;
+
+pub use chart::{Chart, MAX_SAMPLES, Series, Style};
+pub use cloud::{Cloud3d, MAX_POINTS};
+pub use relief::{MAX_CELLS, Relief};
+
+/// Why a page could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    /// A picture could not be encoded.
+    #[error("a picture of the report: {0}")]
+    Picture(#[from] image::ImageError),
+    /// A chart could not be drawn.
+    #[error("the chart {title:?}: {message}")]
+    Chart {
+        /// Its title.
+        title: String,
+        /// What the plotting library said.
+        message: String,
+    },
+    /// The page could not be put together.
+    #[error("the page of the report: {0}")]
+    Page(#[from] minijinja::Error),
+}
+
+/// What a page shows, in this order; empty parts are left away.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Headline.
+    pub title: String,
+    /// Where it comes from: a line below the headline.
+    pub source: String,
+    /// What a reader must know before believing anything.
+    pub warnings: Vec<String>,
+    /// Name and value of the figures that matter.
+    pub figures: Vec<(String, String)>,
+    /// Lines and marks over axes.
+    pub charts: Vec<Chart>,
+    /// The ground in colour.
+    pub cloud: Option<Cloud3d>,
+    /// Heights.
+    pub relief: Option<Relief>,
+    /// Pictures with a caption each.
+    pub pictures: Vec<(String, RgbImage)>,
+    /// What happened: at which frame, and what.
+    pub events: Vec<(String, String)>,
+    /// The configuration, as text.
+    pub config: String,
+}
+
+#[derive(Serialize)]
+struct Page<'a> {
+    title: &'a str,
+    source: &'a str,
+    warnings: &'a [String],
+    figures: &'a [(String, String)],
+    charts: Vec<String>,
+    cloud: Option<cloud::Packed>,
+    relief: Option<relief::Packed>,
+    pictures: Vec<(&'a str, String)>,
+    events: &'a [(String, String)],
+    config: &'a str,
+    style: &'static str,
+    cloud_script: &'static str,
+    relief_script: &'static str,
+}
+
+impl Report {
+    /// The page.
+    ///
+    /// # Errors
+    /// When a picture or a chart cannot be made.
+    pub fn html(&self) -> Result<String, ReportError> {
+        let mut pages = Environment::new();
+        pages.set_auto_escape_callback(|_| AutoEscape::Html);
+        let page = Page {
+            title: &self.title,
+            source: &self.source,
+            warnings: &self.warnings,
+            figures: &self.figures,
+            charts: (self.charts.iter().map(Chart::svg)).collect::<Result<_, _>>()?,
+            cloud: self.cloud.as_ref().and_then(Cloud3d::pack),
+            relief: self.relief.as_ref().map(Relief::pack).transpose()?,
+            pictures: (self.pictures.iter())
+                .map(|(caption, picture)| Ok((caption.as_str(), jpeg(picture)?)))
+                .collect::<Result<_, ReportError>>()?,
+            events: &self.events,
+            config: &self.config,
+            style: include_str!("page.css"),
+            cloud_script: include_str!("cloud.js"),
+            relief_script: include_str!("relief.js"),
+        };
+        Ok(pages.render_str(include_str!("page.html"), Serde(page))?)
+    }
+}
+
+fn jpeg(picture: &RgbImage) -> Result<String, ReportError> {
+    data_uri(picture, ImageFormat::Jpeg)
+}
+
+fn data_uri(picture: &RgbImage, format: ImageFormat) -> Result<String, ReportError> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, format)?;
+    let kind = format.to_mime_type();
+    Ok(format!("data:{kind};base64,{}", base64(bytes.get_ref())))
+}
+
+fn base64(bytes: &[u8]) -> String {
+    BASE64_STANDARD.encode(bytes)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,94 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use clap::Parser;
+
+use crate::commands::{data, eval, map, report, slam};
+use crate::output::Output;
+
+/// The main job with nothing to set up: traverse, trajectory, terrain, report
+#[derive(Parser)]
+#[command(after_help = "Examples:\n  \
+    barchan demo\n  \
+    barchan demo --data folder:my_images --out day1")]
+pub struct Args {
+    /// Your images; a rendered traverse without
+    #[arg(long, value_name = "DATA")]
+    data: Option<String>,
+    /// What sees disparity: x.onnx, x.safetensors, sgm, bm or a shipped name
+    #[arg(long, default_value = "tiny")]
+    model: String,
+    /// The directory that is written
+    #[arg(long, value_name = "DIR", default_value = "demo")]
+    out: PathBuf,
+}
+
+/// What is rendered where no images are given.
+const TRAVERSE: &str = "synth:seed=1,frames=60";
+
+pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
+    let inside = |name: &str| args.out.join(name).display().to_string();
+    let (rendered, slam_run, map_dir) = (inside("data"), inside("slam"), inside("map"));
+    let data = match &args.data {
+        Some(data) => {
+            let check: data::Args = typed(output, &["data", "check", data])?;
+            if !data::run(check, output)? {
+                output.notice(
+                    "the check found something, see above; what can be mended is mended on the way",
+                );
+            }
+            data.clone()
+        }
+        None => {
+            let synth = typed(output, &["data", "synth", TRAVERSE, "--out", &rendered])?;
+            data::run(synth, output)?;
+            format!("folder:{rendered}")
+        }
+    };
+    let command = [
+        "slam",
+        "--data",
+        &data,
+        "--model",
+        &args.model,
+        "--out",
+        &slam_run,
+    ];
+    slam::run(typed(output, &command)?, output, runtime)?;
+    map::run(
+        typed(output, &["map", &slam_run, "--out", &map_dir])?,
+        output,
+    )?;
+    let truth = inside("data/groundtruth.tum");
+    if args.data.is_none() {
+        let estimate = inside("slam/trajectory.tum");
+        let command = ["eval", "trajectory", "--est", &estimate, "--gt", &truth];
+        eval::run(typed(output, &command)?, output)?;
+    }
+    let page = inside("report.html");
+    let mut command = vec!["report", &slam_run, "--map", &map_dir, "--out", &page];
+    if args.data.is_none() {
+        command.extend(["--gt", &truth]);
+    }
+    report::run(typed(output, &command)?, output)?;
+
+    output.say(&format!(
+        "\nWhere to look:\n  {page}  everything on one page (any browser)\n  {map_dir}/cloud.ply  the ground in colour (CloudCompare, MeshLab)\n  \
+         {map_dir}/dem.tif  its heights, and hillshade.tif beside it (QGIS)\n  {slam_run}/trajectory.tum  the route (evo)"
+    ));
+    if args.data.is_some() {
+        let train = inside("train");
+        output.say(&format!(
+            "\nThe network has not seen your ground. To let it learn from these images (they need no truth), and then again:\n  \
+             barchan train --finetune --data {data} --out {train}\n  barchan demo --data {data} --model {train}/weights.safetensors --out {}",
+            args.out.display()
+        ));
+    }
+    Ok(())
+}
+
+/// A command as anybody could type it, said before it is done.
+fn typed<A: Parser>(output: &Output, words: &[&str]) -> Result<A> {
+    output.say(&format!("\n$ barchan {}", words.join(" ")));
+    Ok(A::try_parse_from(words)?)
+}
