@@ -2,9 +2,11 @@
 //! `disparity_burn` against `disparity_onnxruntime`, tracking against the camera's period.
 
 use barchan_datasets::{StereoFrame, open};
+use barchan_geometry::nalgebra::{Point3, Vector3, Vector6};
+use barchan_geometry::{Se3, se3};
 use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Rejection, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
-use barchan_slam::{Slam, SlamConfig};
+use barchan_slam::{BundleAdjustment, Observation, Slam, SlamConfig};
 use barchan_terrain::{Cloud, DepthLimits, VoxelMap};
 use divan::Bencher;
 
@@ -98,4 +100,51 @@ fn voxels_of_one_frame(bencher: Bencher) {
         map.insert(&cloud);
         map.len()
     });
+}
+
+/// Local bundle adjustment: 20 key frames, two of them fixed, 2000 points, 8000 stereo sightings, ten iterations.
+#[divan::bench(sample_count = 20)]
+fn bundle_adjustment(bencher: Bencher) {
+    let (_, rig) = frames(1);
+    // Each point is seen by four key frames in a row.
+    let point = |k: usize| {
+        let share = |step: usize| (k * step % 1009) as f64 / 1009.0 - 0.5;
+        Point3::new(
+            4.0 * share(389),
+            1.0 + share(613),
+            4.0 + 3.0 * share(151) + 0.1 * (k % 17) as f64,
+        )
+    };
+    let poses: Vec<Se3> = (0..20)
+        .map(|k| se3::exp(&Vector6::new(0.0, 0.0, -0.1 * f64::from(k), 0.0, 0.0, 0.0)))
+        .collect();
+    let mut observations = Vec::new();
+    for k in 0..2000 {
+        for pose in k % 17..k % 17 + 4 {
+            let seen = rig
+                .project(&(poses[pose] * point(k)))
+                .expect("all points lie ahead");
+            let noise = ((k * 7919 + pose * 104_729) % 101) as f64 / 101.0 - 0.5;
+            let sighting = Observation {
+                point: point(k),
+                u: seen.u + noise,
+                v: seen.v - noise,
+                d: Some(seen.d + 0.5 * noise),
+                sigma: 1.0,
+                sigma_d: 2.0,
+            };
+            observations.push((pose, k, sighting));
+        }
+    }
+    let problem = BundleAdjustment {
+        T_cam_world: poses,
+        fixed: (0..20).map(|k| k < 2).collect(),
+        points: (0..2000)
+            .map(|k| point(k) + Vector3::repeat(0.02))
+            .collect(),
+        observations,
+    };
+    bencher
+        .with_inputs(|| problem.clone())
+        .bench_local_values(|mut problem| problem.solve(&rig, 10));
 }

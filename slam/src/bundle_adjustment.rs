@@ -5,7 +5,7 @@ use nalgebra::{
     DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Matrix6x3, Point3, Vector3, Vector6,
 };
 
-use crate::pose::{HUBER, Observation, huber_cost, huber_weight, reprojection_jacobian};
+use crate::pose::{HUBER, Observation, huber_cost, huber_weight};
 
 /// A problem: poses of which some are fixed, points, and who sees what.
 #[allow(non_snake_case)]
@@ -126,14 +126,20 @@ impl BundleAdjustment {
         lambda: f64,
     ) -> Option<Steps> {
         let n = 6 * unknown_poses;
+        // Of symmetric matrices the lower triangle is filled, which is what the factorisation reads.
         let mut reduced = DMatrix::<f64>::zeros(n, n);
         let mut right = DVector::<f64>::zeros(n);
+        let mut poses = vec![(Matrix6::<f64>::zeros(), Vector6::<f64>::zeros()); unknown_poses];
+        let rotations: Vec<Matrix3<f64>> = (self.T_cam_world.iter())
+            .map(|pose| pose.rotation.to_rotation_matrix().into_inner())
+            .collect();
+        // Blocks between points and the free poses that see them, point after point.
+        let mut coupled: Vec<(usize, Matrix6x3<f64>)> = Vec::with_capacity(self.observations.len());
         let mut eliminated = Vec::with_capacity(self.points.len());
         for (point, sightings) in by_point.iter().enumerate() {
-            let mut h_points = Matrix3::<f64>::zeros();
+            let mut h_point = Matrix3::<f64>::zeros();
             let mut g_point = Vector3::<f64>::zeros();
-            // Blocks between this point and the free poses that see it.
-            let mut coupled: Vec<(usize, Matrix6x3<f64>)> = Vec::with_capacity(sightings.len());
+            let first = coupled.len();
             for i in sightings {
                 let (pose, _, o) = &self.observations[*i];
                 let p_cam = self.T_cam_world[*pose] * self.points[point];
@@ -142,65 +148,65 @@ impl BundleAdjustment {
                 };
                 let weight = huber_weight(residual.norm_squared(), HUBER);
                 let projection = o.whiten(rig.projection_jacobian(&p_cam));
-                let by_position: Matrix3<f64> = projection
-                    * self.T_cam_world[*pose]
-                        .rotation
-                        .to_rotation_matrix()
-                        .matrix();
-                h_points += by_position.transpose() * by_position * weight;
-                g_point += by_position.transpose() * residual * weight;
+                let by_position = projection * rotations[*pose];
+                let weighted = by_position * weight;
+                h_point += weighted.tr_mul(&by_position);
+                g_point += weighted.tr_mul(&residual);
                 if let Some(slot) = free[*pose] {
-                    let by_pose: Matrix3x6<f64> = o.whiten(reprojection_jacobian(rig, &p_cam));
-                    let h_pose: Matrix6<f64> = by_pose.transpose() * by_pose * weight;
-                    let g_pose: Vector6<f64> = by_pose.transpose() * residual * weight;
-                    let mut block = reduced.fixed_view_mut::<6, 6>(6 * slot, 6 * slot);
-                    block += h_pose;
-                    let mut segment = right.fixed_rows_mut::<6>(6 * slot);
-                    segment += g_pose;
-                    coupled.push((slot, by_pose.transpose() * by_position * weight));
+                    let mut by_pose = Matrix3x6::<f64>::zeros();
+                    by_pose.fixed_columns_mut::<3>(0).copy_from(&projection);
+                    let by_turn = -projection * se3::skew(&p_cam.coords);
+                    by_pose.fixed_columns_mut::<3>(3).copy_from(&by_turn);
+                    let (h_pose, g_pose) = &mut poses[slot];
+                    *h_pose += by_pose.tr_mul(&by_pose) * weight;
+                    *g_pose += by_pose.tr_mul(&residual) * weight;
+                    coupled.push((slot, by_pose.tr_mul(&weighted)));
                 }
             }
             let damped =
-                h_points + Matrix3::from_diagonal(&(h_points.diagonal() * lambda).add_scalar(1e-9));
-            eliminated.push(
-                damped
-                    .try_inverse()
-                    .map(|inverse| (inverse, g_point, coupled)),
-            );
-        }
-        for k in 0..n {
-            reduced[(k, k)] += lambda * reduced[(k, k)] + 1e-9;
-        }
-        for (inverse, g_point, coupled) in eliminated.iter().flatten() {
-            for (a, w_a) in coupled {
+                h_point + Matrix3::from_diagonal(&(h_point.diagonal() * lambda).add_scalar(1e-9));
+            let Some(inverse) = damped.try_inverse() else {
+                coupled.truncate(first);
+                eliminated.push(None);
+                continue;
+            };
+            let blocks = first..coupled.len();
+            for (a, w_a) in &coupled[blocks.clone()] {
                 let scaled = w_a * inverse;
                 let mut segment = right.fixed_rows_mut::<6>(6 * a);
                 segment -= scaled * g_point;
-                for (b, w_b) in coupled {
+                for (b, w_b) in coupled[blocks.clone()].iter().filter(|(b, _)| b <= a) {
                     let mut block = reduced.fixed_view_mut::<6, 6>(6 * a, 6 * b);
                     block -= scaled * w_b.transpose();
                 }
             }
+            eliminated.push(Some((inverse, g_point, blocks)));
         }
-        let solved = if n == 0 {
-            right
-        } else {
-            reduced.cholesky()?.solve(&right)
+        for (slot, (mut h_pose, g_pose)) in poses.into_iter().enumerate() {
+            let damping = (h_pose.diagonal() * lambda).add_scalar(1e-9);
+            h_pose += Matrix6::from_diagonal(&damping);
+            let mut block = reduced.fixed_view_mut::<6, 6>(6 * slot, 6 * slot);
+            block += h_pose;
+            let mut segment = right.fixed_rows_mut::<6>(6 * slot);
+            segment += g_pose;
+        }
+        let solved = match n {
+            0 => right,
+            _ => reduced.cholesky()?.solve(&right),
         };
         let pose_steps: Vec<Vector6<f64>> = (0..unknown_poses)
             .map(|k| solved.fixed_rows::<6>(6 * k).into_owned())
             .collect();
         let point_steps = eliminated
-            .iter()
+            .into_iter()
             .map(|e| {
-                e.as_ref()
-                    .map_or_else(Vector3::zeros, |(inverse, g_point, coupled)| {
-                        let pulled: Vector3<f64> = coupled
-                            .iter()
-                            .map(|(slot, w)| w.transpose() * pose_steps[*slot])
-                            .sum();
-                        inverse * (g_point - pulled)
-                    })
+                e.map_or_else(Vector3::zeros, |(inverse, g_point, blocks)| {
+                    let pulled: Vector3<f64> = coupled[blocks]
+                        .iter()
+                        .map(|(slot, w)| w.tr_mul(&pose_steps[*slot]))
+                        .sum();
+                    inverse * (g_point - pulled)
+                })
             })
             .collect();
         Some((pose_steps, point_steps))
