@@ -11,7 +11,7 @@ mod preview;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 /// From unlabelled rover stereo to metric terrain.
 #[derive(Parser)]
@@ -50,6 +50,8 @@ enum Command {
     Eval(commands::eval::Args),
     Data(commands::data::Args),
     Doctor(commands::doctor::Args),
+    Completions(commands::completions::CompletionsArgs),
+    Man(commands::completions::ManArgs),
 }
 
 fn main() -> ExitCode {
@@ -77,6 +79,10 @@ fn main() -> ExitCode {
             other => other.map(|_| ()),
         },
         Command::Doctor(args) => commands::doctor::run(args, &output, runtime),
+        Command::Completions(args) => {
+            commands::completions::completions(args, Cli::command(), &output)
+        }
+        Command::Man(args) => commands::completions::man(args, Cli::command(), &output),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -11,6 +11,9 @@ use crate::output::Output;
 
 /// Say what is installed, what works, and how to get the rest
 #[derive(Parser)]
+#[command(after_help = "Examples:\n  \
+    barchan doctor\n  \
+    barchan doctor --onnxruntime /opt/onnxruntime/libonnxruntime.so --json")]
 pub struct Args {}
 
 #[derive(Serialize)]

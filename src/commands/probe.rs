@@ -16,6 +16,7 @@ use crate::output::Output;
         reads everywhere.",
     after_help = "Examples:\n  \
         barchan probe hitnet.onnx\n  \
+        barchan probe crestereo.onnx --json\n  \
         barchan infer --data DATA --model hitnet.onnx --out out"
 )]
 pub struct Args {

@@ -10,7 +10,7 @@ use crate::output::Output;
 /// Products of any DEM
 #[derive(Parser)]
 #[command(
-    after_help = "Example:\n  barchan raster hillshade dem.tif --out hillshade.tif --azimuth 300 --altitude 30"
+    after_help = "Examples:\n  barchan raster hillshade dem.tif --out hillshade.tif\n  barchan raster hillshade dem.tif --out hillshade.tif --azimuth 300 --altitude 30"
 )]
 pub struct Args {
     #[command(subcommand)]
