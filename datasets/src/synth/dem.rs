@@ -176,9 +176,11 @@ pub(super) fn build(
     let [long, wide] = [dem.width, dem.height].map(|n| (n - 1) as f64 * dem.cell / 2.0);
     let middle = dem.corner + Vector2::new(long, wide);
     let room = long.min(wide) - MARGIN;
-    plan.scale = (room / Plan::REACH).min(1.0);
+    let most = room / Plan::REACH;
     let length = options.frames as f64 * super::INTERVAL * options.speed;
-    if plan.scale < 0.2 || !plan.stays_within(room, length) {
+    let has_room = options.round.is_none() || plan.scale <= most;
+    plan.scale = plan.scale.min(most);
+    if !has_room || plan.scale < 0.2 || !plan.stays_within(room, length) {
         let message = format!(
             "{:.1} x {:.1} m are too small for this route of {length:.1} m: ask for fewer frames, another route or a larger grid",
             2.0 * long,

@@ -19,6 +19,7 @@ tracks=true       wheel tracks of an earlier drive
 sun=AZ:EL         degrees: where the sun stands, from x towards y, and above the horizon
 sky=hazy          hazy, clear or black
 route=circle      circle, loop (crosses itself), survey (lanes, stops, full turns) or straight
+round=56          metres of a round of the circle, from 15; more than 56 only on a dem that has room
 speed=0.4         metres a second; a frame is taken every 0.2 s
 stops=0           metres between stops of 6 s (survey: 6, with a full turn of the mast in 24 s)
 pan=0             degrees, where the mast looks, to the left of ahead positive (survey: -90)
@@ -83,6 +84,8 @@ pub(super) struct Options {
     pub sun: Option<[f64; 2]>,
     pub sky: Option<Sky>,
     pub route: RouteKind,
+    /// Metres of a round of the circle.
+    pub round: Option<f64>,
     pub speed: f64,
     pub stops: Option<f64>,
     /// Radians.
@@ -128,6 +131,7 @@ impl Default for Options {
             sun: None,
             sky: None,
             route: RouteKind::Circle,
+            round: None,
             speed: 0.4,
             stops: None,
             pan: None,
@@ -173,6 +177,13 @@ impl Options {
                 };
                 return Err(reader.bad(format!("unknown option \"{key}\"; known: {keys}")));
             }
+        }
+        // Hills ring the invented ground.
+        if options.dem.is_none() && options.round.is_some_and(|round| round > 57.0) {
+            return Err(DataError::Layout {
+                spec: format!("synth:{spec}"),
+                message: "a round of more than 56 m needs a dem=PATH that has room for it".into(),
+            });
         }
         Ok(options)
     }
@@ -254,6 +265,7 @@ impl Options {
                     ("straight", RouteKind::Straight),
                 ])?;
             }
+            "round" => self.round = Some(read.within(15.0, 2000.0, "metres")?),
             "speed" => self.speed = read.within(0.01, 2.0, "metres a second")?,
             "stops" => self.stops = Some(read.within(0.0, 1000.0, "metres")?),
             "pan" => self.pan = Some(read.within(-360.0f64, 360.0, "degrees")?.to_radians()),
@@ -275,7 +287,7 @@ impl Options {
 }
 
 const COMMON: [&str; 6] = ["seed", "frames", "width", "height", "baseline", "noise"];
-const ROVER: [&str; 24] = [
+const ROVER: [&str; 25] = [
     "look",
     "texture",
     "dem",
@@ -286,6 +298,7 @@ const ROVER: [&str; 24] = [
     "sun",
     "sky",
     "route",
+    "round",
     "speed",
     "stops",
     "pan",
@@ -378,7 +391,15 @@ mod tests {
         assert_eq!(options.sky, Some(Sky::Black));
         assert_eq!(options.route, RouteKind::Survey);
         assert_eq!(options.dem, Some(PathBuf::from("a/b.tif")));
-        for bad in ["sun=1:2", "sun=10", "dem=", "dem", "speed=nan", "tracks=1"] {
+        for bad in [
+            "sun=1:2",
+            "sun=10",
+            "dem=",
+            "dem",
+            "speed=nan",
+            "tracks=1",
+            "round=100",
+        ] {
             assert!(Options::parse(bad, false).is_err(), "{bad}");
         }
     }

@@ -41,6 +41,8 @@ pub(super) struct Plan {
 impl Plan {
     /// The radius of the circle, metres, for a scale of 1.
     pub const RADIUS: f64 = 9.0;
+    /// A round of the circle, metres, for a scale of 1.
+    pub const ROUND: f64 = TAU * Self::RADIUS;
     /// The reach of every closed route from the middle of the site, metres, for a scale of 1.
     pub const REACH: f64 = 10.0;
 
@@ -51,7 +53,7 @@ impl Plan {
         Self {
             kind: options.route,
             centre: Vector2::zeros(),
-            scale: 1.0,
+            scale: options.round.map_or(1.0, |round| round / Self::ROUND),
             start: share * TAU,
             speed: options.speed,
             between_stops: options.stops.unwrap_or(if survey { 6.0 } else { 0.0 }),
@@ -254,6 +256,15 @@ mod tests {
                 let (x, y) = (plan.heading(k as f64 * 0.02), (b - a) / step);
                 assert!((x - y).norm() < 0.03, "{route} {k}: {x} {y}");
             }
+        }
+    }
+
+    #[test]
+    fn a_round_is_as_long_as_asked_for() {
+        for round in [20.0, 120.0] {
+            let plan = plan(&format!("round={round},seed=3"));
+            assert!((plan.place(round) - plan.place(0.0)).norm() < 1e-9);
+            assert!((plan.place(round / 2.0) - plan.place(0.0)).norm() > 0.25 * round);
         }
     }
 
