@@ -10,6 +10,7 @@
 //!
 //! What it never does: read files, name a network library, or make terrain.
 
+mod block_cholesky;
 mod bundle_adjustment;
 mod config;
 mod features;
@@ -19,6 +20,7 @@ mod mapping;
 mod matching;
 mod patch;
 mod pose;
+mod pose_graph;
 mod slam;
 mod tracker;
 
@@ -29,6 +31,7 @@ pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use matching::{DisparityGate, MatchCounts, hamming};
 pub use patch::Patch;
 pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
+pub use pose_graph::{PoseEdge, PoseGraph};
 pub use slam::{FrameReport, Slam, SlamResult};
 
 /// Why SLAM cannot go on.
