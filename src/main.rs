@@ -49,6 +49,7 @@ enum Command {
     Report(commands::report::Args),
     Eval(commands::eval::Args),
     Data(commands::data::Args),
+    Vocabulary(commands::vocabulary::Args),
     Doctor(commands::doctor::Args),
     Completions(commands::completions::CompletionsArgs),
     Man(commands::completions::ManArgs),
@@ -78,6 +79,7 @@ fn main() -> ExitCode {
             Ok(false) => return ExitCode::from(1),
             other => other.map(|_| ()),
         },
+        Command::Vocabulary(args) => commands::vocabulary::run(args, &output),
         Command::Doctor(args) => commands::doctor::run(args, &output, runtime),
         Command::Completions(args) => {
             commands::completions::completions(args, Cli::command(), &output)

@@ -1,5 +1,7 @@
 use serde::{Deserialize, Serialize};
 
+use crate::loops::LoopConfig;
+
 /// Everything that decides how SLAM runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -45,6 +47,8 @@ pub struct SlamConfig {
     pub restart_after: usize,
     /// Seeds the sampling of the fall-back.
     pub seed: u64,
+    /// Places seen before.
+    pub loops: LoopConfig,
 }
 
 impl Default for SlamConfig {
@@ -69,6 +73,7 @@ impl Default for SlamConfig {
             min_view_share: 0.08,
             restart_after: 5,
             seed: 1,
+            loops: LoopConfig::default(),
         }
     }
 }

@@ -15,24 +15,29 @@ mod bundle_adjustment;
 mod config;
 mod features;
 mod frame;
+mod loops;
 mod map;
 mod mapping;
 mod matching;
 mod patch;
+mod places;
 mod pose;
 mod pose_graph;
 mod slam;
 mod tracker;
+mod vocabulary;
 
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
 pub use config::SlamConfig;
 pub use features::{Descriptor, Features, Keypoint, Orb};
+pub use loops::{LoopConfig, LoopEvent, LoopPoints};
 pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use matching::{DisparityGate, MatchCounts, hamming};
 pub use patch::Patch;
 pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
 pub use pose_graph::{PoseEdge, PoseGraph};
 pub use slam::{FrameReport, Slam, SlamResult};
+pub use vocabulary::{BagOfWords, Vocabulary, VocabularyError};
 
 /// Why SLAM cannot go on.
 #[derive(Debug, thiserror::Error)]

@@ -9,10 +9,12 @@ use serde::Serialize;
 
 use crate::features::Orb;
 use crate::frame::Seen;
+use crate::loops::{LoopCloser, LoopEvent};
 use crate::map::{Keyframe, Map};
 use crate::mapping::insert_keyframe;
 use crate::matching::{DisparityGate, MatchCounts};
 use crate::tracker::{Placement, Tracker};
+use crate::vocabulary::Vocabulary;
 use crate::{SlamConfig, SlamError};
 
 /// What became of one frame.
@@ -38,6 +40,8 @@ pub struct FrameReport {
     pub ms_track: f64,
     /// Milliseconds of dense disparity; 0 where none was asked for.
     pub ms_disparity: f64,
+    /// Places that the key frame looked like; a closed loop moved the map.
+    pub loops: Vec<LoopEvent>,
     /// Dense disparity after rejection, at key frames when there is an engine. Not serialised.
     #[serde(skip)]
     pub dense: Option<DisparityMap>,
@@ -81,6 +85,7 @@ pub struct Slam {
     lost: usize,
     /// See [`SlamResult::restarts`].
     restarts: Vec<usize>,
+    loops: Option<LoopCloser>,
 }
 
 impl Slam {
@@ -92,6 +97,8 @@ impl Slam {
     ) -> Self {
         Self {
             orb: Orb::new(config.features, config.corner_threshold),
+            loops: (config.loops.enabled)
+                .then(|| LoopCloser::new(rig, config.clone(), Vocabulary::orb())),
             tracker: Tracker::new(rig, config.clone()),
             rig,
             config,
@@ -126,6 +133,7 @@ impl Slam {
             matches: seen.matches,
             ms_track: 0.0,
             ms_disparity: 0.0,
+            loops: Vec::new(),
             dense: None,
         };
         let enough_stereo = report.stereo >= self.config.min_inliers;
@@ -236,6 +244,10 @@ impl Slam {
             &self.rig,
             &self.config,
         );
+        if let Some(closer) = &mut self.loops {
+            let dense = report.dense.as_ref().map(|d| &d.disparity);
+            report.loops = closer.close(&mut self.map, dense, &self.restarts);
+        }
         self.most_inliers = 0;
         let settled = self.map.keyframes[keyframe].T_cam_world;
         self.tracker.corrected_to(settled);

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use barchan_datasets::{StereoFrame, StereoSource, open};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
-use barchan_slam::{FrameReport, Slam, SlamConfig, SlamError, SlamResult};
+use barchan_slam::{FrameReport, LoopEvent, Slam, SlamConfig, SlamError, SlamResult};
 use block_matcher::BlockMatcher;
 
 fn slam(source: &dyn StereoSource) -> Slam {
@@ -133,6 +133,40 @@ fn a_rendered_traverse() {
     // Steps are short, and one ground is harder than another: their mean.
     let mean = step_errors / seeds.len() as f64;
     assert!(mean <= 0.6, "{mean} %");
+}
+
+#[test]
+fn a_round_is_closed_and_the_drift_goes() {
+    let spec = "synth:seed=2,round=16,speed=1,frames=100,width=256,height=192";
+    let source = open(spec).unwrap();
+    let images: Vec<StereoFrame> = frames(source.as_ref()).collect();
+    let truth = &source.true_trajectory().unwrap().poses;
+    let run = |enabled| {
+        let mut config = SlamConfig::default();
+        config.loops.enabled = enabled;
+        let slam = Slam::new(*source.rig(), config, None);
+        let (reports, result) = track(slam, images.iter().cloned());
+        let events: Vec<LoopEvent> = reports.into_iter().flat_map(|r| r.loops).collect();
+        (events, score_of(&result, source.as_ref()))
+    };
+    let (events, closed) = run(true);
+    assert!(events.iter().any(|e| e.closed), "{events:?}");
+    for event in events.iter().filter(|e| e.closed) {
+        let [here, there] = [event.frame, event.earlier_frame].map(|k| truth[k].T_world_cam);
+        let apart = (here.inverse() * there).translation.vector.norm();
+        assert!(apart < 1.0, "{apart}: {event:?}");
+    }
+    let (none, open) = run(false);
+    assert!(none.is_empty());
+    assert!(closed.ate_rmse < 0.6 * open.ate_rmse, "{closed:?} {open:?}");
+}
+
+#[test]
+fn nothing_is_seen_again_on_a_straight_line() {
+    let spec = "synth:seed=1,route=straight,speed=1.5,frames=60,width=256,height=192";
+    let source = open(spec).unwrap();
+    let (reports, _) = track(slam(source.as_ref()), frames(source.as_ref()));
+    assert!(reports.iter().flat_map(|r| &r.loops).all(|e| !e.closed));
 }
 
 #[test]

@@ -14,3 +14,4 @@ pub mod raster;
 pub mod report;
 pub mod slam;
 pub mod train;
+pub mod vocabulary;

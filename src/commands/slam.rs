@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
 use barchan_geometry::{Rig, Trajectory};
 use barchan_infer::DisparityMap;
-use barchan_slam::{MatchCounts, Slam, SlamConfig, SlamResult};
+use barchan_slam::{LoopEvent, MatchCounts, Slam, SlamConfig, SlamResult};
 use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
@@ -19,7 +19,8 @@ use crate::output::{Output, StagedDir, percentiles};
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan slam --data images/ --model a.onnx --out runs/s\n  \
-    barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches")]
+    barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
+    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -34,6 +35,9 @@ pub struct Args {
     /// Disparity does not accept or refuse feature matches
     #[arg(long)]
     no_gate: bool,
+    /// Places seen before are not looked for: the trajectory drifts
+    #[arg(long)]
+    no_loops: bool,
     /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -56,6 +60,7 @@ struct Summary {
     tracked: usize,
     keyframes: usize,
     loops: usize,
+    loop_events: Vec<LoopEvent>,
     restarts: Vec<usize>,
     points: usize,
     ms_track_median: f64,
@@ -89,6 +94,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
         (0, vec![], vec![], MatchCounts::default());
     let mut total_ms = 0.0;
+    let mut loops = Vec::<LoopEvent>::new();
     for frame in prefetch(source, (0..frames).collect(), 4) {
         let frame = frame?;
         let mut report = slam.track(&frame)?;
@@ -102,6 +108,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             matches.gate += report.matches.gate;
             matches.refused += report.matches.refused;
         }
+        for event in report.loops.iter().filter(|l| l.closed) {
+            output.notice(&format!(
+                "frame {} sees the place of frame {} again: {} map points agree, the loop moves it by {:.3} m",
+                event.frame, event.earlier_frame, event.map_points[1], event.moved
+            ));
+        }
+        loops.extend(report.loops.iter().cloned());
         tracked += usize::from(report.tracked);
         track_ms.push(report.ms_track);
         total_ms += report.ms_track + report.ms_disparity;
@@ -131,7 +144,8 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         frames,
         tracked,
         keyframes: result.keyframes.len(),
-        loops: 0,
+        loops: loops.iter().filter(|l| l.closed).count(),
+        loop_events: loops,
         restarts: result.restarts.clone(),
         points: result.map.points.len(),
         ms_track_median,
@@ -143,10 +157,11 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     out.write_json("summary.json", &summary)?;
     out.finish()?;
     let text = format!(
-        "{tracked} of {frames} frames tracked, {} key frames, {} points; {ms_track_median:.1} ms a frame (p95 {ms_track_p95:.1}), \
+        "{tracked} of {frames} frames tracked, {} key frames, {} loops, {} points; {ms_track_median:.1} ms a frame (p95 {ms_track_p95:.1}), \
          {:.1} ms disparity a key frame, {:.1} frames/s\nstereo matches at key frames: {} by ratio, {} more by disparity, {} refused by disparity\n\
          {}: trajectory.tum trajectory.kitti keyframes.tum map.ply",
         summary.keyframes,
+        summary.loops,
         summary.points,
         summary.ms_disparity_median,
         summary.fps,
@@ -167,6 +182,7 @@ fn configuration(args: &Args) -> Result<SlamConfig> {
         }
     };
     config.gate &= !args.no_gate;
+    config.loops.enabled &= !args.no_loops;
     config.features = args.features.unwrap_or(config.features);
     config.keyframe_ratio = args.keyframe_ratio.unwrap_or(config.keyframe_ratio);
     Ok(config)
