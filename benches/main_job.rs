@@ -6,7 +6,7 @@ use barchan_geometry::nalgebra::{Point3, Vector3, Vector6};
 use barchan_geometry::{Se3, se3};
 use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Rejection, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
-use barchan_slam::{BundleAdjustment, Observation, Slam, SlamConfig};
+use barchan_slam::{BundleAdjustment, Observation, PoseEdge, PoseGraph, Slam, SlamConfig};
 use barchan_terrain::{Cloud, DepthLimits, VoxelMap};
 use divan::Bencher;
 
@@ -76,6 +76,44 @@ fn slam_track_8_frames(bencher: Bencher) {
             .filter(|f| slam.track(f).is_ok_and(|r| r.tracked))
             .count()
     });
+}
+
+/// A rover's drive of two laps: 5000 poses, and 500 of the second lap know where they are by loops.
+#[divan::bench(sample_count = 10)]
+#[allow(non_snake_case)]
+fn pose_graph_5000_poses_5500_edges(bencher: Bencher) {
+    let pose = |k: usize| {
+        let angle = std::f64::consts::TAU * k as f64 / 2500.0;
+        let place = Vector3::new(angle.cos(), angle.sin(), 0.0) * 80.0;
+        Se3::new(place, Vector3::z() * angle)
+    };
+    // Every motion is turned by a little: drift.
+    let drift = Se3::rotation(Vector3::new(1e-5, 0.0, 3e-5));
+    let edge = |a: usize, b: usize, drift: Se3| PoseEdge {
+        a,
+        b,
+        T_a_b: pose(a).inverse() * pose(b) * drift,
+        sigma_translation: 0.005,
+        sigma_rotation: 0.0005,
+        robust: b > a + 1,
+    };
+    let successive = (1..5000).map(|k| edge(k - 1, k, drift));
+    let loops = (0..501).map(|k| edge(4 * k, 4 * k + 2500, Se3::identity()));
+    let mut graph = PoseGraph {
+        T_world_cam: vec![pose(0)],
+        fixed: (0..5000).map(|k| k == 0).collect(),
+        edges: successive.chain(loops).collect(),
+    };
+    for k in 1..5000 {
+        let next = graph.T_world_cam[k - 1] * graph.edges[k - 1].T_a_b;
+        graph.T_world_cam.push(next);
+    }
+    bencher
+        .with_inputs(|| graph.clone())
+        .bench_local_values(|mut graph| {
+            graph.solve(30);
+            graph
+        });
 }
 
 #[divan::bench(sample_count = 20)]

@@ -43,6 +43,9 @@ pub struct Orb {
 }
 
 impl Orb {
+    /// Bytes of a descriptor that say something.
+    pub const BYTES: usize = 32;
+
     /// Looks for about `features` corners with a brightness step of at least `threshold` of 255.
     pub fn new(features: usize, threshold: f32) -> Self {
         let detector = OrbDetector {

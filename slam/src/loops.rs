@@ -37,6 +37,8 @@ const NEIGHBOURS: usize = 3;
 pub struct LoopConfig {
     /// Whether loops are looked for at all.
     pub enabled: bool,
+    /// Whether a loop corrects the map; else it is reported only.
+    pub correct: bool,
     /// Where the points come from that prove a loop.
     pub points: LoopPoints,
     /// Least likeness of a place, as a share of the likeness of two successive key frames.
@@ -55,6 +57,7 @@ impl Default for LoopConfig {
     fn default() -> Self {
         Self {
             enabled: true,
+            correct: true,
             points: LoopPoints::Dense,
             min_score: 0.3,
             min_streak: 3,
@@ -88,9 +91,9 @@ pub struct LoopEvent {
     pub matches: [usize; 2],
     /// Map points of the earlier place found in the frame, and how many agree with the motion.
     pub map_points: [usize; 2],
-    /// Whether that is proof, and the loop was closed.
-    pub closed: bool,
-    /// How far closing it moved the frame, metres.
+    /// Whether that is proof.
+    pub proved: bool,
+    /// How far closing the loop moved the frame, metres.
     pub moved: f64,
 }
 
@@ -151,8 +154,8 @@ impl LoopCloser {
         let mut events = Vec::new();
         for island in islands.iter().filter(|i| i.streak >= loops.min_streak) {
             let (mut event, found) = self.verify(map, newest, island);
-            event.closed = found.is_some();
-            if let Some(found) = found {
+            event.proved = found.is_some();
+            if let Some(found) = found.filter(|_| loops.correct) {
                 let before = map.keyframes[newest].T_cam_world.inverse();
                 self.correct(map, newest, island.keyframe, &found, restarts);
                 self.fuse(map, newest, island.keyframe, &found);
@@ -195,7 +198,7 @@ impl LoopCloser {
             score: island.score,
             matches: [0; 2],
             map_points: [0; 2],
-            closed: false,
+            proved: false,
             moved: 0.0,
         };
         let least = self.config.loops.min_inliers;

@@ -1,5 +1,6 @@
 //! The whole: frames in, reports and a map out.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use barchan_datasets::StereoFrame;
@@ -109,6 +110,13 @@ impl Slam {
             lost: 0,
             restarts: Vec::new(),
         }
+    }
+
+    /// Recognises places by these words instead of the shipped ones.
+    pub fn with_vocabulary(mut self, words: Vocabulary) -> Self {
+        self.loops = (self.config.loops.enabled)
+            .then(|| LoopCloser::new(self.rig, self.config.clone(), Arc::new(words)));
+        self
     }
 
     /// Places one frame against the map, and makes it a key frame when matches run low: under a

@@ -92,6 +92,11 @@ impl Vocabulary {
         self.words == 0
     }
 
+    /// Bytes of a descriptor that its words tell apart.
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
     /// Learns words from the descriptors of many images, of which the first `bytes` bytes count.
     /// Each node's descriptors are split into at most `branching` groups around their majorities
     /// (k-means with the Hamming distance, seeded as k-means++: Arthur 2007), `depth` times. A word

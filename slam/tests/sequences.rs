@@ -150,8 +150,8 @@ fn a_round_is_closed_and_the_drift_goes() {
         (events, score_of(&result, source.as_ref()))
     };
     let (events, closed) = run(true);
-    assert!(events.iter().any(|e| e.closed), "{events:?}");
-    for event in events.iter().filter(|e| e.closed) {
+    assert!(events.iter().any(|e| e.proved), "{events:?}");
+    for event in events.iter().filter(|e| e.proved) {
         let [here, there] = [event.frame, event.earlier_frame].map(|k| truth[k].T_world_cam);
         let apart = (here.inverse() * there).translation.vector.norm();
         assert!(apart < 1.0, "{apart}: {event:?}");
@@ -166,7 +166,7 @@ fn nothing_is_seen_again_on_a_straight_line() {
     let spec = "synth:seed=1,route=straight,speed=1.5,frames=60,width=256,height=192";
     let source = open(spec).unwrap();
     let (reports, _) = track(slam(source.as_ref()), frames(source.as_ref()));
-    assert!(reports.iter().flat_map(|r| &r.loops).all(|e| !e.closed));
+    assert!(reports.iter().flat_map(|r| &r.loops).all(|e| !e.proved));
 }
 
 #[test]

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
 use barchan_geometry::{Rig, Trajectory};
 use barchan_infer::DisparityMap;
-use barchan_slam::{LoopEvent, MatchCounts, Slam, SlamConfig, SlamResult};
+use barchan_slam::{LoopEvent, MatchCounts, Orb, Slam, SlamConfig, SlamResult, Vocabulary};
 use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
@@ -38,6 +38,9 @@ pub struct Args {
     /// Places seen before are not looked for: the trajectory drifts
     #[arg(long)]
     no_loops: bool,
+    /// Visual words to recognise places by, from `barchan vocabulary` or DBoW2, instead of the shipped
+    #[arg(long, value_name = "FILE")]
+    vocabulary: Option<PathBuf>,
     /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -79,6 +82,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             args.data
         );
     }
+    let words = args.vocabulary.as_deref().map(vocabulary).transpose()?;
     let engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     out.write("config.toml", toml::to_string(&config)?)?;
@@ -89,6 +93,9 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     );
 
     let mut slam = Slam::new(*source.rig(), config, Some(engine));
+    if let Some(words) = words {
+        slam = slam.with_vocabulary(words);
+    }
     let frames = source.len();
     let bar = output.progress("slam", frames);
     let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
@@ -108,13 +115,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             matches.gate += report.matches.gate;
             matches.refused += report.matches.refused;
         }
-        for event in report.loops.iter().filter(|l| l.closed) {
+        report.loops.iter().filter(|l| l.proved).for_each(|event| {
             output.notice(&format!(
                 "frame {} sees the place of frame {} again: {} map points agree, the loop moves it by {:.3} m",
                 event.frame, event.earlier_frame, event.map_points[1], event.moved
             ));
-        }
-        loops.extend(report.loops.iter().cloned());
+            loops.push(event.clone());
+        });
         tracked += usize::from(report.tracked);
         track_ms.push(report.ms_track);
         total_ms += report.ms_track + report.ms_disparity;
@@ -144,7 +151,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         frames,
         tracked,
         keyframes: result.keyframes.len(),
-        loops: loops.iter().filter(|l| l.closed).count(),
+        loops: loops.len(),
         loop_events: loops,
         restarts: result.restarts.clone(),
         points: result.map.points.len(),
@@ -186,6 +193,20 @@ fn configuration(args: &Args) -> Result<SlamConfig> {
     config.features = args.features.unwrap_or(config.features);
     config.keyframe_ratio = args.keyframe_ratio.unwrap_or(config.keyframe_ratio);
     Ok(config)
+}
+
+fn vocabulary(path: &Path) -> Result<Vocabulary> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let words: Vocabulary = text.parse().with_context(|| path.display().to_string())?;
+    if words.bytes() != Orb::BYTES {
+        bail!(
+            "{}: its words are {} bytes long, but descriptors of ORB features {}\n  cure: make one with `barchan vocabulary`",
+            path.display(),
+            words.bytes(),
+            Orb::BYTES
+        );
+    }
+    Ok(words)
 }
 
 /// Files that sort as their key frames follow each other.

@@ -8,9 +8,6 @@ use serde::Serialize;
 
 use crate::output::Output;
 
-/// Bytes of an ORB descriptor.
-const ORB_BYTES: usize = 32;
-
 /// Learn the visual words by which `barchan slam` recognises places
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
@@ -64,7 +61,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         bar.finish_and_clear();
     }
     let (branching, depth) = (usize::from(args.branching), usize::from(args.depth));
-    let vocabulary = Vocabulary::train(&images, branching, depth, ORB_BYTES, args.seed);
+    let vocabulary = Vocabulary::train(&images, branching, depth, Orb::BYTES, args.seed);
     if vocabulary.is_empty() {
         bail!("no features in {:?}: are the images blank?", args.data);
     }
