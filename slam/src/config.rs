@@ -12,9 +12,9 @@ pub struct SlamConfig {
     pub corner_threshold: f32,
     /// Nearest-neighbour distance ratio below which a stereo match is accepted on looks alone.
     pub nndr: f64,
-    /// Most differing bits, of 256, of two descriptors that match.
-    pub max_hamming: u32,
-    /// Largest row difference of a stereo match, pixels, at the finest octave.
+    /// Most differing bits of two descriptors that match, as a share of all.
+    pub max_hamming_share: f64,
+    /// Largest row difference of a stereo match, pixels, at the finest scale.
     pub row_tolerance: f64,
     /// Smallest disparity of a point that is mapped, pixels; smaller ones say too little of depth.
     pub min_disparity: f64,
@@ -23,7 +23,7 @@ pub struct SlamConfig {
     /// motion is better taken from where points go than from how their disparity changes.
     pub disparity_sigma: f64,
     /// Standard deviation of a sighting found by alignment with the point's first picture, in pixels
-    /// of its octave.
+    /// of its scale.
     pub alignment_sigma: f64,
     /// Whether dense disparity at key frames accepts and refuses matches (Hong 2021, 3.2.3).
     pub gate: bool,
@@ -57,7 +57,7 @@ impl Default for SlamConfig {
             features: 900,
             corner_threshold: 5.0,
             nndr: 0.75,
-            max_hamming: 64,
+            max_hamming_share: 0.25,
             row_tolerance: 1.5,
             min_disparity: 1.5,
             disparity_sigma: 2.0,
@@ -75,5 +75,12 @@ impl Default for SlamConfig {
             seed: 1,
             loops: LoopConfig::default(),
         }
+    }
+}
+
+impl SlamConfig {
+    /// Most differing bits of two descriptors of `bits` bits that match.
+    pub(crate) fn max_hamming(&self, bits: u32) -> u32 {
+        (self.max_hamming_share * f64::from(bits)) as u32
     }
 }

@@ -3,7 +3,7 @@
 use barchan_datasets::{Plane, StereoFrame, luma};
 use barchan_geometry::RectifiedRig;
 
-use crate::features::{Features, Orb};
+use crate::features::{FeatureDetector, Features};
 use crate::matching::{DisparityGate, Grid, MatchCounts, stereo_matches};
 use crate::{SlamConfig, SlamError};
 
@@ -26,7 +26,7 @@ impl Seen {
     pub fn new(
         frame: &StereoFrame,
         rig: &RectifiedRig,
-        orb: &Orb,
+        detector: &dyn FeatureDetector,
         config: &SlamConfig,
     ) -> Result<Self, SlamError> {
         for image in [&frame.left, &frame.right] {
@@ -42,7 +42,7 @@ impl Seen {
             }
         }
         let grey = [luma(&frame.left), luma(&frame.right)];
-        let (left, right) = rayon::join(|| orb.extract(&grey[0]), || orb.extract(&grey[1]));
+        let (left, right) = rayon::join(|| detector.detect(&grey[0]), || detector.detect(&grey[1]));
         let failed = |message| SlamError::Features {
             frame: frame.name.clone(),
             message,

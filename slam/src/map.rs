@@ -38,8 +38,8 @@ pub struct MapPoint {
     pub position: Point3<f64>,
     /// What it looked like when last seen by a key frame.
     pub descriptor: Descriptor,
-    /// Pyramid level at which it was last seen.
-    pub octave: u8,
+    /// Scale at which it was last seen, see [`Keypoint::scale`](crate::Keypoint::scale).
+    pub scale: f64,
     /// Its picture when it was first seen, where it is far enough from the border.
     pub patch: Option<Patch>,
     /// Its colour, sRGB.
@@ -75,7 +75,7 @@ impl Map {
         let point = MapPoint {
             position,
             descriptor: frame.features.descriptors[feature],
-            octave: frame.features.keypoints[feature].octave,
+            scale: frame.features.keypoints[feature].scale,
             colour,
             patch,
             observations: vec![(keyframe, feature)],
@@ -91,7 +91,7 @@ impl Map {
             frame.points[feature] = Some(id);
             point.observations.push((keyframe, feature));
             point.descriptor = frame.features.descriptors[feature];
-            point.octave = frame.features.keypoints[feature].octave;
+            point.scale = frame.features.keypoints[feature].scale;
         }
     }
 

@@ -6,7 +6,6 @@ use nalgebra::{Point3, Vector2};
 
 use crate::SlamConfig;
 use crate::bundle_adjustment::BundleAdjustment;
-use crate::features::octave_scale;
 use crate::frame::Seen;
 use crate::map::{Keyframe, Map, PointId};
 use crate::patch::Patch;
@@ -78,7 +77,7 @@ fn add_new_points(
         let colour = left.get_pixel_checked(at.u.round() as u32, at.v.round() as u32);
         if let (false, Some(p_cam), Some(colour)) = (known, rig.back_project(place), colour) {
             let colour = colour.0.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
-            let (centre, spacing) = (Vector2::new(at.u, at.v), octave_scale(at.octave));
+            let (centre, spacing) = (Vector2::new(at.u, at.v), at.scale);
             let patch = Patch::cut(&seen.grey[0], centre, spacing, p_cam.z);
             map.add_point(keyframe, feature, pose.inverse() * p_cam, colour, patch);
         }

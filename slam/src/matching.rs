@@ -4,7 +4,7 @@ use barchan_datasets::Plane;
 use barchan_geometry::RectifiedRig;
 use serde::{Deserialize, Serialize};
 
-use crate::features::{Descriptor, Features, octave_scale};
+use crate::features::{Descriptor, Features};
 use crate::{Keypoint, SlamConfig};
 
 /// Differing bits of two descriptors.
@@ -49,7 +49,7 @@ impl DisparityGate<'_> {
 
 /// Disparity of each left feature, where it has a match in the right image.
 ///
-/// A candidate lies in the same rows, at most an octave away, before the cameras and no nearer than
+/// A candidate lies in the same rows, at most a level of scale away, before the cameras and no nearer than
 /// a disparity of a quarter of the width: no rig of use is focused there. The
 /// nearest neighbour by descriptor is accepted when it is clearly nearer than the second **or** the
 /// gate agrees with it, and refused when the gate contradicts it; the position is then refined by
@@ -64,16 +64,17 @@ pub(crate) fn stereo_matches(
 ) -> (Vec<Option<f64>>, MatchCounts) {
     let mut counts = MatchCounts::default();
     let range = -1.0 - rig.doffs..rig.width as f64 / 4.0;
+    let max_hamming = config.max_hamming(right.bits);
     let rows = by_row(&right.keypoints, images[1].height() as usize);
     let disparities = left
         .keypoints
         .iter()
         .zip(&left.descriptors)
         .map(|(keypoint, descriptor)| {
-            let reach = config.row_tolerance * octave_scale(keypoint.octave);
+            let reach = config.row_tolerance * keypoint.scale;
             let in_reach = |r: &Keypoint| {
                 (r.v - keypoint.v).abs() <= reach
-                    && r.octave.abs_diff(keypoint.octave) <= 1
+                    && levels_apart(r, keypoint) <= 1.0
                     && range.contains(&(keypoint.u - r.u))
             };
             let from = (keypoint.v - reach).max(0.0) as usize;
@@ -85,7 +86,7 @@ pub(crate) fn stereo_matches(
                 .copied()
                 .filter(|r| in_reach(&right.keypoints[*r]));
             let (best, distance, second) = two_nearest(descriptor, candidates, right)?;
-            if distance > config.max_hamming {
+            if distance > max_hamming {
                 return None;
             }
             let coarse = keypoint.u - right.keypoints[best].u;
@@ -107,6 +108,13 @@ pub(crate) fn stereo_matches(
     (disparities, counts)
 }
 
+/// How many levels of scale lie between two features. Detectors step by a fifth, or nearly so: a
+/// level here is a little more, so that neighbours of either kind are one apart.
+fn levels_apart(a: &Keypoint, b: &Keypoint) -> f64 {
+    const LEVEL: f64 = 1.22;
+    (a.scale / b.scale).ln().abs() / LEVEL.ln()
+}
+
 /// Indices of key points by their row.
 fn by_row(keypoints: &[Keypoint], height: usize) -> Vec<Vec<usize>> {
     let mut rows = vec![Vec::new(); height];
@@ -119,7 +127,7 @@ fn by_row(keypoints: &[Keypoint], height: usize) -> Vec<Vec<usize>> {
 }
 
 /// The nearest feature, its distance, and that of the nearest one elsewhere: the same corner at a
-/// neighbouring octave, within 3 pixels, is no rival.
+/// neighbouring scale, within 3 pixels, is no rival.
 fn two_nearest(
     descriptor: &Descriptor,
     candidates: impl Iterator<Item = usize>,
@@ -139,7 +147,7 @@ fn two_nearest(
         .filter(|(_, i)| elsewhere(*i))
         .map(|(d, _)| *d)
         .min()
-        .unwrap_or(256);
+        .unwrap_or(features.bits);
     Some((best, distance, second))
 }
 
@@ -187,7 +195,7 @@ fn refine_disparity([left, right]: [&Plane; 2], keypoint: &Keypoint, coarse: f64
 }
 
 /// A feature of the image for each map point that is expected in it: `expected` gives descriptor,
-/// position and octave of point `i`. A feature takes the point that looks most like it.
+/// position and scale of point `i`. A feature takes the point that looks most like it.
 pub(crate) fn match_projections(
     expected: &[(Descriptor, Keypoint)],
     features: &Features,
@@ -195,21 +203,22 @@ pub(crate) fn match_projections(
     radius: f64,
     config: &SlamConfig,
 ) -> Vec<(usize, usize)> {
+    let max_hamming = config.max_hamming(features.bits);
     // For each feature, the best point so far.
     let mut taken: Vec<Option<(u32, usize)>> = vec![None; features.keypoints.len()];
     for (point, (descriptor, at)) in expected.iter().enumerate() {
-        let reach = radius * octave_scale(at.octave).sqrt();
+        let reach = radius * at.scale.sqrt();
         let near = |i: &usize| {
             let k = features.keypoints[*i];
             (k.u - at.u).abs() <= reach
                 && (k.v - at.v).abs() <= reach
-                && k.octave.abs_diff(at.octave) <= 2
+                && levels_apart(&k, at) <= 2.0
         };
         let candidates = grid.around(at.u, at.v, reach).filter(near);
         let Some((best, distance, second)) = two_nearest(descriptor, candidates, features) else {
             continue;
         };
-        if distance > config.max_hamming || f64::from(distance) > 0.9 * f64::from(second) {
+        if distance > max_hamming || f64::from(distance) > 0.9 * f64::from(second) {
             continue;
         }
         if taken[best].is_none_or(|(d, _)| distance < d) {
@@ -229,13 +238,13 @@ pub(crate) fn match_all(
     b: &Features,
     config: &SlamConfig,
 ) -> Vec<(usize, usize)> {
+    let max_hamming = config.max_hamming(b.bits);
     let forward: Vec<Option<(usize, u32)>> = a
         .iter()
         .map(|descriptor| {
             let (best, distance, second) = two_nearest(descriptor, 0..b.descriptors.len(), b)?;
-            (distance <= config.max_hamming
-                && f64::from(distance) < config.nndr * f64::from(second))
-            .then_some((best, distance))
+            (distance <= max_hamming && f64::from(distance) < config.nndr * f64::from(second))
+                .then_some((best, distance))
         })
         .collect();
     let mut taken: Vec<Option<(u32, usize)>> = vec![None; b.descriptors.len()];
@@ -299,12 +308,12 @@ mod tests {
 
     #[test]
     fn hamming_counts_differing_bits() {
-        let mut other = [0u8; 32];
-        assert_eq!(hamming(&[0; 32], &other), 0);
+        let mut other = [0u8; 64];
+        assert_eq!(hamming(&[0; 64], &other), 0);
         other[3] = 0b101;
-        other[31] = 0x80;
-        assert_eq!(hamming(&[0; 32], &other), 3);
-        assert_eq!(hamming(&[0; 32], &[0xff; 32]), 256);
+        other[63] = 0x80;
+        assert_eq!(hamming(&[0; 64], &other), 3);
+        assert_eq!(hamming(&[0; 64], &[0xff; 64]), 512);
     }
 
     /// A texture and itself moved by a fraction of a pixel.
@@ -329,7 +338,7 @@ mod tests {
             let at = Keypoint {
                 u: 40.0,
                 v: 20.0,
-                octave: 0,
+                scale: 1.0,
                 sigma: 1.0,
             };
             let found = refine_disparity([&left, &right], &at, 5.0).unwrap();
@@ -346,12 +355,13 @@ mod tests {
         let keypoint = |u: f64| Keypoint {
             u,
             v: 20.0,
-            octave: 0,
+            scale: 1.0,
             sigma: 1.0,
         };
         let features = |us: &[f64]| Features {
             keypoints: us.iter().map(|u| keypoint(*u)).collect(),
-            descriptors: vec![[7; 32]; us.len()],
+            descriptors: vec![[7; 64]; us.len()],
+            bits: 256,
         };
         let config = SlamConfig::default();
         let rig = RectifiedRig {

@@ -12,7 +12,7 @@ const INNER: usize = SIDE - 2;
 #[derive(Clone, Debug)]
 pub struct Patch {
     samples: [f32; SIDE * SIDE],
-    /// Pixels between samples: the scale of the feature's octave.
+    /// Pixels between samples: the scale of the feature.
     spacing: f64,
     /// Depth of the point when the patch was cut, metres.
     depth: f64,

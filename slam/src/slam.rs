@@ -8,7 +8,7 @@ use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
 use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
 use serde::Serialize;
 
-use crate::features::Orb;
+use crate::features::{FeatureDetector, Orb};
 use crate::frame::Seen;
 use crate::loops::{LoopCloser, LoopEvent};
 use crate::map::{Keyframe, Map};
@@ -75,7 +75,7 @@ struct Placed {
 pub struct Slam {
     rig: RectifiedRig,
     config: SlamConfig,
-    orb: Orb,
+    detector: Box<dyn FeatureDetector>,
     engine: Option<Box<dyn DisparityEngine>>,
     tracker: Tracker,
     map: Map,
@@ -97,7 +97,7 @@ impl Slam {
         engine: Option<Box<dyn DisparityEngine>>,
     ) -> Self {
         Self {
-            orb: Orb::new(config.features, config.corner_threshold),
+            detector: Box::new(Orb::new(config.features, config.corner_threshold)),
             loops: (config.loops.enabled)
                 .then(|| LoopCloser::new(rig, config.clone(), Vocabulary::orb())),
             tracker: Tracker::new(rig, config.clone()),
@@ -129,7 +129,7 @@ impl Slam {
     #[allow(non_snake_case)]
     pub fn track(&mut self, frame: &StereoFrame) -> Result<FrameReport, SlamError> {
         let started = Instant::now();
-        let seen = Seen::new(frame, &self.rig, &self.orb, &self.config)?;
+        let seen = Seen::new(frame, &self.rig, self.detector.as_ref(), &self.config)?;
         let mut report = FrameReport {
             frame: frame.index,
             name: frame.name.clone(),

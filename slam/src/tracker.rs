@@ -5,7 +5,7 @@ use nalgebra::{Vector2, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::features::{Descriptor, octave_scale};
+use crate::features::Descriptor;
 use crate::frame::Seen;
 use crate::map::{Map, PointId};
 use crate::matching::{match_all, match_projections};
@@ -210,7 +210,7 @@ impl Tracker {
         found.map_or(corner, |at| Keypoint {
             u: at.x,
             v: at.y,
-            sigma: self.config.alignment_sigma * octave_scale(corner.octave),
+            sigma: self.config.alignment_sigma * corner.scale,
             ..corner
         })
     }
@@ -235,8 +235,8 @@ impl Tracker {
                 let at = Keypoint {
                     u: at.u,
                     v: at.v,
-                    octave: point.octave,
-                    sigma: octave_scale(point.octave),
+                    scale: point.scale,
+                    sigma: point.scale,
                 };
                 ids.push(*id);
                 expected.push((point.descriptor, at));

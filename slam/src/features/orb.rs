@@ -1,40 +1,15 @@
-//! Key points and their descriptors.
-
 use barchan_datasets::Plane;
 use kornia_image::{Image, ImageSize};
 use kornia_imgproc::features::OrbDetector;
 
-/// 256 binary comparisons.
-pub type Descriptor = [u8; 32];
-
-/// Where a corner was seen.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Keypoint {
-    /// Column, pixels.
-    pub u: f64,
-    /// Row, pixels.
-    pub v: f64,
-    /// Level of the image pyramid, 0 the finest.
-    pub octave: u8,
-    /// Standard deviation of the position, pixels: a corner is found to a pixel of its level.
-    pub sigma: f64,
-}
+use super::{Descriptor, FeatureDetector, Features, Keypoint};
 
 /// Scale between two levels of the pyramid.
-pub(crate) const OCTAVE_SCALE: f64 = 1.2;
+const OCTAVE_SCALE: f64 = 1.2;
 
 /// Size of a pixel of a pyramid level, in pixels of the image.
-pub(crate) fn octave_scale(octave: u8) -> f64 {
+fn octave_scale(octave: u8) -> f64 {
     OCTAVE_SCALE.powi(i32::from(octave))
-}
-
-/// The features of an image.
-#[derive(Clone, Debug, Default)]
-pub struct Features {
-    /// Where.
-    pub keypoints: Vec<Keypoint>,
-    /// What it looks like, one a key point.
-    pub descriptors: Vec<Descriptor>,
 }
 
 /// Oriented FAST and rotated BRIEF (Rublee 2011), spread over the image by a quadtree.
@@ -57,12 +32,10 @@ impl Orb {
         };
         Self { detector }
     }
+}
 
-    /// Features of a grey image in 0..=1.
-    ///
-    /// # Errors
-    /// What the detector says, when the image is too small for it.
-    pub fn extract(&self, grey: &Plane) -> Result<Features, String> {
+impl FeatureDetector for Orb {
+    fn detect(&self, grey: &Plane) -> Result<Features, String> {
         let bytes = grey
             .iter()
             .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)
@@ -82,19 +55,28 @@ impl Orb {
             .zip(&found.octaves)
             .map(|(xy, octave)| {
                 let [u, v] = full_resolution(*xy, *octave, [grey.width(), grey.height()]);
+                let scale = octave_scale(*octave);
+                // A corner is found to a pixel of its level.
                 Keypoint {
                     u,
                     v,
-                    octave: *octave,
-                    sigma: octave_scale(*octave),
+                    scale,
+                    sigma: scale,
                 }
             })
             .collect();
         Ok(Features {
             keypoints,
-            descriptors: found.descriptors,
+            descriptors: found.descriptors.iter().map(padded).collect(),
+            bits: 256,
         })
     }
+}
+
+fn padded(bits: &[u8; 32]) -> Descriptor {
+    let mut descriptor = [0; 64];
+    descriptor[..32].copy_from_slice(bits);
+    descriptor
 }
 
 /// Where a corner of a pyramid level lies in the image. The detector multiplies by the nominal
@@ -121,17 +103,13 @@ mod tests {
         let image = Plane::from_fn(300, 200, |u, v| {
             image::Luma([if u >= x && v >= y { 0.1 } else { 0.8 }])
         });
-        let features = Orb::new(300, 20.0).extract(&image).unwrap();
+        let features = Orb::new(300, 20.0).detect(&image).unwrap();
         let mut levels = std::collections::BTreeSet::new();
         for k in &features.keypoints {
             let (du, dv) = (k.u - (f64::from(x) - 0.5), k.v - (f64::from(y) - 0.5));
             if du.hypot(dv) < 12.0 {
-                assert!(
-                    du.hypot(dv) < 2.0 * k.sigma,
-                    "level {}: {du} {dv}",
-                    k.octave
-                );
-                levels.insert(k.octave);
+                assert!(du.hypot(dv) < 2.0 * k.sigma, "scale {}: {du} {dv}", k.scale);
+                levels.insert(k.scale.to_bits());
             }
         }
         assert!(levels.len() >= 5, "{levels:?}");
@@ -143,7 +121,7 @@ mod tests {
             let image = Plane::from_fn(width, height, |u, v| {
                 image::Luma([((u * v) % 7) as f32 / 7.0])
             });
-            let found = Orb::new(100, 5.0).extract(&image);
+            let found = Orb::new(100, 5.0).detect(&image);
             assert!(
                 found.is_ok_and(|f| f.keypoints.len() == f.descriptors.len()),
                 "{width} x {height}"
