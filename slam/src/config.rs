@@ -1,15 +1,30 @@
 use serde::{Deserialize, Serialize};
 
+use crate::features::{Akaze, FeatureDetector, Orb};
 use crate::loops::LoopConfig;
+
+/// Which features SLAM follows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Detector {
+    /// [`Orb`]: the fast choice.
+    Orb,
+    /// [`Akaze`]: what Hong 2021 uses.
+    Akaze,
+}
 
 /// Everything that decides how SLAM runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SlamConfig {
-    /// Key points asked for in each image. The quadtree that spreads them gives up to half as many more.
+    /// The detector.
+    pub detector: Detector,
+    /// Key points asked for in each image. The quadtree that spreads ORB's gives up to half as many more.
     pub features: usize,
-    /// Smallest brightness step of a corner, of 255.
+    /// Smallest brightness step of a corner of ORB, of 255.
     pub corner_threshold: f32,
+    /// Least response of AKAZE, see [`Akaze::threshold`].
+    pub akaze_threshold: f32,
     /// Nearest-neighbour distance ratio below which a stereo match is accepted on looks alone.
     pub nndr: f64,
     /// Most differing bits of two descriptors that match, as a share of all.
@@ -54,8 +69,10 @@ pub struct SlamConfig {
 impl Default for SlamConfig {
     fn default() -> Self {
         Self {
+            detector: Detector::Orb,
             features: 900,
             corner_threshold: 5.0,
+            akaze_threshold: 1e-4,
             nndr: 0.75,
             max_hamming_share: 0.25,
             row_tolerance: 1.5,
@@ -79,6 +96,17 @@ impl Default for SlamConfig {
 }
 
 impl SlamConfig {
+    /// The detector with its settings.
+    pub fn feature_detector(&self) -> Box<dyn FeatureDetector> {
+        match self.detector {
+            Detector::Orb => Box::new(Orb::new(self.features, self.corner_threshold)),
+            Detector::Akaze => Box::new(Akaze {
+                threshold: self.akaze_threshold,
+                most: self.features,
+            }),
+        }
+    }
+
     /// Most differing bits of two descriptors of `bits` bits that match.
     pub(crate) fn max_hamming(&self, bits: u32) -> u32 {
         (self.max_hamming_share * f64::from(bits)) as u32

@@ -28,8 +28,8 @@ mod tracker;
 mod vocabulary;
 
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
-pub use config::SlamConfig;
-pub use features::{Descriptor, FeatureDetector, Features, Keypoint, Orb};
+pub use config::{Detector, SlamConfig};
+pub use features::{Akaze, Descriptor, FeatureDetector, Features, Keypoint, Orb};
 pub use loops::{LoopConfig, LoopEvent, LoopPoints};
 pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use matching::{DisparityGate, MatchCounts, hamming};

@@ -8,7 +8,7 @@ use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
 use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
 use serde::Serialize;
 
-use crate::features::{FeatureDetector, Orb};
+use crate::features::FeatureDetector;
 use crate::frame::Seen;
 use crate::loops::{LoopCloser, LoopEvent};
 use crate::map::{Keyframe, Map};
@@ -97,7 +97,7 @@ impl Slam {
         engine: Option<Box<dyn DisparityEngine>>,
     ) -> Self {
         Self {
-            detector: Box::new(Orb::new(config.features, config.corner_threshold)),
+            detector: config.feature_detector(),
             loops: (config.loops.enabled)
                 .then(|| LoopCloser::new(rig, config.clone(), Vocabulary::orb())),
             tracker: Tracker::new(rig, config.clone()),

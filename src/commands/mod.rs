@@ -7,6 +7,7 @@ pub mod demo;
 pub mod doctor;
 pub mod eval;
 pub mod export;
+pub mod features;
 pub mod infer;
 pub mod map;
 pub mod probe;

@@ -11,6 +11,7 @@ use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
 
+use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
@@ -19,6 +20,7 @@ use crate::output::{Output, StagedDir, percentiles};
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan slam --data images/ --model a.onnx --out runs/s\n  \
+    barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
     barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
     barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
 pub struct Args {
@@ -44,9 +46,12 @@ pub struct Args {
     /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// What is followed from image to image (default orb)
+    #[arg(long, value_enum)]
+    features: Option<FeatureKind>,
     /// Key points looked for in each image
-    #[arg(long)]
-    features: Option<usize>,
+    #[arg(long, value_name = "COUNT")]
+    keypoints: Option<usize>,
     /// A key frame is made when matches fall under this share
     #[arg(long)]
     keyframe_ratio: Option<f64>,
@@ -190,7 +195,8 @@ fn configuration(args: &Args) -> Result<SlamConfig> {
     };
     config.gate &= !args.no_gate;
     config.loops.enabled &= !args.no_loops;
-    config.features = args.features.unwrap_or(config.features);
+    config.detector = args.features.map_or(config.detector, FeatureKind::into);
+    config.features = args.keypoints.unwrap_or(config.features);
     config.keyframe_ratio = args.keyframe_ratio.unwrap_or(config.keyframe_ratio);
     Ok(config)
 }

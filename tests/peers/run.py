@@ -9,6 +9,7 @@ import argparse
 import shutil
 from pathlib import Path
 
+import features
 import files
 import matching
 import network
@@ -53,6 +54,9 @@ def main() -> None:
     def matchers(table: Table) -> None:
         matching.check(table, barchan, shared, work)
 
+    def key_points(table: Table) -> None:
+        features.check(table, barchan, shared, work)
+
     def trajectories(table: Table) -> None:
         cases = {
             "made up": trajectory.made_up_case(work),
@@ -77,7 +81,7 @@ def main() -> None:
     def timings(table: Table) -> None:
         speed.report(barchan, work)
 
-    Table().run([prepare, exported, engines, matchers, trajectories, terrain, formats, browser, timings])
+    Table().run([prepare, exported, engines, matchers, key_points, trajectories, terrain, formats, browser, timings])
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 //! Key points and their descriptors.
 
+mod akaze;
 mod orb;
 
 use barchan_datasets::Plane;
 
+pub use akaze::Akaze;
 pub use orb::Orb;
 
 /// Binary comparisons, a bit each; a detector with fewer than 512 leaves the rest zero.

@@ -1,0 +1,276 @@
+//! Filters over whole planes. The work of a row is in functions of slices that the compiler turns
+//! into vector instructions of the machine at hand; rows are shared among threads.
+
+use std::array::from_fn;
+
+use barchan_datasets::Plane;
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+/// Fewest rows that are worth a task of their own.
+const ROWS: usize = 16;
+
+/// The centre weight of Scharr's derivative, whose outer weights are 1.
+const CENTRE: f32 = 10.0 / 3.0;
+/// Makes the response of Scharr's kernels with outer samples `spacing` pixels away a derivative
+/// times `spacing`: normalised for scale.
+const SCHARR: f32 = 0.5 / (CENTRE + 2.0);
+
+/// Row `y` of a plane.
+pub(super) fn row(plane: &Plane, y: usize) -> &[f32] {
+    let width = plane.width() as usize;
+    &plane.as_raw()[y * width..][..width]
+}
+
+/// Gaussian blur with a kernel of `N` pixels; the border goes on as it ends.
+pub(super) fn blur<const N: usize>(image: &Plane, sigma: f32) -> Plane {
+    let radius = N / 2;
+    let weight = |k: usize| (-0.5 * ((k as f32 - radius as f32) / sigma).powi(2)).exp();
+    let sum: f32 = (0..N).map(weight).sum();
+    let kernel: [f32; N] = from_fn(|k| weight(k) / sum);
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let mut blurred = Plane::new(image.width(), image.height());
+    blurred
+        .par_chunks_exact_mut(width)
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each_init(
+            || vec![0.0; width + 2 * radius],
+            |column, (y, out)| {
+                let rows =
+                    from_fn(|k| row(image, (y + k).clamp(radius, height - 1 + radius) - radius));
+                weighted_sum(&kernel, rows, &mut column[radius..radius + width]);
+                let (first, last) = (column[radius], column[radius + width - 1]);
+                column[..radius].fill(first);
+                column[radius + width..].fill(last);
+                weighted_sum(&kernel, from_fn(|k| &column[k..k + width]), out);
+            },
+        );
+    blurred
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn weighted_sum<const N: usize>(kernel: &[f32; N], rows: [&[f32]; N], out: &mut [f32]) {
+    let n = out.len();
+    let rows = rows.map(|r| &r[..n]);
+    for x in 0..n {
+        let mut sum = 0.0;
+        for k in 0..N {
+            sum += kernel[k] * rows[k][x];
+        }
+        out[x] = sum;
+    }
+}
+
+/// Half the size; each pixel the mean of four. An odd last row or column is left away.
+pub(super) fn halve(image: &Plane) -> Plane {
+    let mut half = Plane::new(image.width() / 2, image.height() / 2);
+    let width = half.width() as usize;
+    half.par_chunks_exact_mut(width)
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each(|(y, out)| {
+            let (above, below) = (row(image, 2 * y), row(image, 2 * y + 1));
+            let pairs = above
+                .as_chunks::<2>()
+                .0
+                .iter()
+                .zip(below.as_chunks::<2>().0);
+            for (out, (a, b)) in out.iter_mut().zip(pairs) {
+                *out = 0.25 * (a[0] + a[1] + b[0] + b[1]);
+            }
+        });
+    half
+}
+
+/// Derivatives along rows and columns by Scharr's kernels with samples `spacing` pixels apart, times
+/// `spacing`; the border mirrors.
+pub(super) fn gradient(image: &Plane, spacing: usize) -> [Plane; 2] {
+    let (width, height) = image.dimensions();
+    let mut planes = [(); 2].map(|()| Plane::new(width, height));
+    let [dx, dy] = &mut planes;
+    let width = width as usize;
+    dx.par_chunks_exact_mut(width)
+        .zip(dy.par_chunks_exact_mut(width))
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each_init(
+            || vec![0.0; width + 2 * spacing],
+            |padded, (y, (dx, dy))| {
+                let rows = rows_around(image, y, spacing);
+                along_row(rows, spacing, padded, dx);
+                along_column(rows, spacing, padded, dy);
+            },
+        );
+    planes
+}
+
+/// Determinant of the Hessian of the image whose [`gradient`] is given.
+pub(super) fn hessian_determinant([dx, dy]: &[Plane; 2], spacing: usize) -> Plane {
+    let mut determinant = Plane::new(dx.width(), dx.height());
+    let width = dx.width() as usize;
+    determinant
+        .par_chunks_exact_mut(width)
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each_init(
+            || {
+                (
+                    vec![0.0; width + 2 * spacing],
+                    [(); 3].map(|()| vec![0.0; width]),
+                )
+            },
+            |(padded, [dxx, dxy, dyy]), (y, out)| {
+                let (of_dx, of_dy) = (rows_around(dx, y, spacing), rows_around(dy, y, spacing));
+                along_row(of_dx, spacing, padded, dxx);
+                along_column(of_dx, spacing, padded, dxy);
+                along_column(of_dy, spacing, padded, dyy);
+                determinant_row(dxx, dxy, dyy, out);
+            },
+        );
+    determinant
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn determinant_row(dxx: &[f32], dxy: &[f32], dyy: &[f32], out: &mut [f32]) {
+    for (((out, xx), xy), yy) in out.iter_mut().zip(dxx).zip(dxy).zip(dyy) {
+        *out = xx * yy - xy * xy;
+    }
+}
+
+/// The rows `spacing` above, at and below `y`, mirrored at the border.
+fn rows_around(image: &Plane, y: usize, spacing: usize) -> [&[f32]; 3] {
+    let last = image.height() as usize - 1;
+    let above = y.abs_diff(spacing).min(last);
+    let below = last.abs_diff(last.abs_diff(y + spacing)).min(last);
+    [
+        row(image, above),
+        row(image, y),
+        row(
+            image,
+            if y + spacing <= last {
+                y + spacing
+            } else {
+                below
+            },
+        ),
+    ]
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn along_row(
+    [above, here, below]: [&[f32]; 3],
+    spacing: usize,
+    padded: &mut [f32],
+    out: &mut [f32],
+) {
+    let n = out.len();
+    let (above, here, below) = (&above[..n], &here[..n], &below[..n]);
+    let smoothed = &mut padded[spacing..spacing + n];
+    for x in 0..n {
+        smoothed[x] = SCHARR * (above[x] + below[x] + CENTRE * here[x]);
+    }
+    mirror(padded, spacing);
+    let (before, after) = (&padded[..n], &padded[2 * spacing..][..n]);
+    for x in 0..n {
+        out[x] = after[x] - before[x];
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn along_column(
+    [above, _, below]: [&[f32]; 3],
+    spacing: usize,
+    padded: &mut [f32],
+    out: &mut [f32],
+) {
+    let n = out.len();
+    let (above, below) = (&above[..n], &below[..n]);
+    let differences = &mut padded[spacing..spacing + n];
+    for x in 0..n {
+        differences[x] = SCHARR * (below[x] - above[x]);
+    }
+    mirror(padded, spacing);
+    let (before, here, after) = (
+        &padded[..n],
+        &padded[spacing..][..n],
+        &padded[2 * spacing..][..n],
+    );
+    for x in 0..n {
+        out[x] = before[x] + after[x] + CENTRE * here[x];
+    }
+}
+
+/// Fills `spacing` places at both ends of a row with what lies as far inside.
+fn mirror(padded: &mut [f32], spacing: usize) {
+    let last = padded.len() - 1 - spacing;
+    for k in 1..=spacing {
+        padded[spacing - k] = padded[(spacing + k).min(last)];
+        padded[last + k] = padded[(last - k.min(last)).max(spacing)];
+    }
+}
+
+/// How well each pixel conducts: little across edges (Perona and Malik's second function).
+pub(super) fn conductivity(smooth: &Plane, contrast: f32) -> Plane {
+    let mut conductivity = Plane::new(smooth.width(), smooth.height());
+    let width = smooth.width() as usize;
+    conductivity
+        .par_chunks_exact_mut(width)
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each_init(
+            || (vec![0.0; width + 2], vec![0.0; width]),
+            |(padded, dx), (y, out)| {
+                let rows = rows_around(smooth, y, 1);
+                along_row(rows, 1, padded, dx);
+                along_column(rows, 1, padded, out);
+                conductivity_row(dx, out, contrast.powi(-2));
+            },
+        );
+    conductivity
+}
+
+/// `out` has the derivative along columns before, and the conductivity after.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn conductivity_row(dx: &[f32], out: &mut [f32], per_squared_contrast: f32) {
+    for (out, dx) in out.iter_mut().zip(dx) {
+        *out = 1.0 / (1.0 + (dx * dx + *out * *out) * per_squared_contrast);
+    }
+}
+
+/// An explicit step of diffusion for the time `tau`; nothing flows over the border.
+pub(super) fn diffuse(image: &Plane, conductivity: &Plane, tau: f32, diffused: &mut Plane) {
+    let (width, last) = (image.width() as usize, image.height() as usize - 1);
+    diffused
+        .par_chunks_exact_mut(width)
+        .enumerate()
+        .with_min_len(ROWS)
+        .for_each(|(y, out)| {
+            let around = [y.saturating_sub(1), y, (y + 1).min(last)];
+            let rows = around.map(|y| row(image, y));
+            let conducts = around.map(|y| row(conductivity, y));
+            diffuse_row(rows, conducts, 0.5 * tau, out);
+        });
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn diffuse_row(
+    [above, here, below]: [&[f32]; 3],
+    [c_above, c_here, c_below]: [&[f32]; 3],
+    half_tau: f32,
+    out: &mut [f32],
+) {
+    let n = out.len();
+    let (above, here, below) = (&above[..n], &here[..n], &below[..n]);
+    let (c_above, c_here, c_below) = (&c_above[..n], &c_here[..n], &c_below[..n]);
+    let flow = |x: usize, to: f32, c_to: f32| (c_here[x] + c_to) * (to - here[x]);
+    let vertical = |x: usize| flow(x, above[x], c_above[x]) + flow(x, below[x], c_below[x]);
+    let to = |x: usize, side: usize| flow(x, here[side], c_here[side]);
+    for x in 1..n.max(1) - 1 {
+        out[x] = here[x] + half_tau * (vertical(x) + to(x, x - 1) + to(x, x + 1));
+    }
+    for x in [0, n - 1] {
+        let sides = to(x, x.saturating_sub(1)) + to(x, (x + 1).min(n - 1));
+        out[x] = here[x] + half_tau * (vertical(x) + sides);
+    }
+}
