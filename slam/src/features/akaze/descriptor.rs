@@ -1,118 +1,194 @@
 //! What a feature looks like: its orientation and the modified local difference binary
 //! (Alcantarilla 2013, 3.4).
 
-use std::array::from_fn;
-use std::f32::consts::TAU;
+use std::f32::consts::{FRAC_PI_2, PI, SQRT_2, TAU};
 
+use multiversion::multiversion;
 use nalgebra::Vector2;
 
 use super::extrema::Peak;
-use super::filters::row;
 use super::scale_space::Level;
 use crate::features::Descriptor;
 
 /// Bits of a descriptor: 3 channels; 6, 36 and 120 pairs of the cells of three grids.
 pub(super) const BITS: u32 = 3 * (6 + 36 + 120);
 /// How far the samples of a descriptor reach, in spacings of the level: the corner of a square.
-pub(super) const REACH: f32 = RADIUS as f32 * std::f32::consts::SQRT_2;
+pub(super) const REACH: f32 = RADIUS as f32 * SQRT_2;
 
+/// Samples of a descriptor lie on a square lattice that reaches so far from the middle.
 const RADIUS: i32 = 10;
 const SIDE: usize = 2 * RADIUS as usize + 1;
-/// Cells along a side of each grid, and samples along a side of a cell.
-const GRIDS: [(usize, usize); 3] = [(2, 10), (3, 7), (4, 5)];
+type Samples = [f32; SIDE * SIDE];
 
 /// The descriptor of a peak: comparisons of the means of brightness and of its two derivatives, over
 /// the cells of three grids that turn with the feature.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 pub(super) fn describe(level: &Level, peak: &Peak) -> Descriptor {
     let samples = sample(level, peak, orientation(level, peak));
-    let mut descriptor = [0; 64];
-    let mut bit = 0;
-    for (cells, side) in GRIDS {
-        for channel in &samples {
-            let sums = cell_sums(channel, cells, side);
-            for (i, a) in sums[..cells * cells].iter().enumerate() {
-                for b in &sums[i + 1..cells * cells] {
-                    descriptor[bit / 8] |= u8::from(a > b) << (bit % 8);
-                    bit += 1;
-                }
-            }
-        }
+    let mut bits = Bits::default();
+    for channel in &samples {
+        compare::<4>(&cell_sums(channel, 2, 10), &mut bits);
+        compare::<9>(&cell_sums(channel, 3, 7), &mut bits);
+        compare::<16>(&cell_sums(channel, 4, 5), &mut bits);
     }
-    descriptor
+    bits.bytes()
 }
 
 /// Cosine and sine of the direction in which most of the brightness around a peak rises: the
 /// longest sum of gradients within any sixth of a circle.
+#[inline(always)]
 fn orientation(level: &Level, peak: &Peak) -> Vector2<f32> {
-    /// Samples reach so many spacings, and weigh by a bell of this width.
+    /// Samples reach less than so many spacings, and weigh by a bell of this width.
     const REACH: i32 = 6;
     const BELL: f32 = 2.5;
+    const SIDE: usize = 2 * REACH as usize - 1;
     /// Slices of the circle, and how many of them are a sixth.
     const SLICES: usize = 42;
     const WINDOW: usize = SLICES / 6;
+    let (width, height) = (level.image.width() as i32, level.image.height() as i32);
+    let [dx, dy] = level
+        .gradient
+        .each_ref()
+        .map(|plane| plane.as_raw().as_slice());
     let spacing = level.spacing as i32;
     let (cx, cy) = (peak.at.x.round() as i32, peak.at.y.round() as i32);
-    let mut slices = [Vector2::zeros(); SLICES];
-    for j in -REACH..=REACH {
-        let y = (cy + j * spacing).clamp(0, level.image.height() as i32 - 1);
-        let [dx, dy] = level
-            .gradient
-            .each_ref()
-            .map(|plane| row(plane, y as usize));
-        for i in -REACH..=REACH {
-            let squared = i * i + j * j;
-            if squared >= REACH * REACH {
-                continue;
+    let offsets: [i32; SIDE] = std::array::from_fn(|k| k as i32 + 1 - REACH);
+    let bell = offsets.map(|i| (-0.5 * (i * i) as f32 / (BELL * BELL)).exp());
+    let (mut x, mut y) = ([0.0; SIDE * SIDE], [0.0; SIDE * SIDE]);
+    for (k, (j, weight_j)) in offsets.iter().zip(&bell).enumerate() {
+        let row = (cy + j * spacing).clamp(0, height - 1) * width;
+        for (l, (i, weight_i)) in offsets.iter().zip(&bell).enumerate() {
+            if i * i + j * j < REACH * REACH {
+                let at = (row + (cx + i * spacing).clamp(0, width - 1)) as usize;
+                x[k * SIDE + l] = weight_i * weight_j * dx[at];
+                y[k * SIDE + l] = weight_i * weight_j * dy[at];
             }
-            let x = (cx + i * spacing).clamp(0, dx.len() as i32 - 1) as usize;
-            let gradient = Vector2::new(dx[x], dy[x]);
-            let turn = gradient.y.atan2(gradient.x) / TAU;
-            let slice = ((turn + 0.5) * SLICES as f32) as usize % SLICES;
-            slices[slice] += (-0.5 * squared as f32 / (BELL * BELL)).exp() * gradient;
         }
     }
-    let window = |first: usize| -> Vector2<f32> {
-        (first..first + WINDOW).map(|k| slices[k % SLICES]).sum()
+    let mut turns = [0.0; SIDE * SIDE];
+    for k in 0..SIDE * SIDE {
+        turns[k] = turn(x[k], y[k]);
+    }
+    let mut slices = [Vector2::zeros(); SLICES];
+    for k in 0..SIDE * SIDE {
+        let slice = ((turns[k] * SLICES as f32) as usize).min(SLICES - 1);
+        slices[slice] += Vector2::new(x[k], y[k]);
+    }
+    let mut longest = Vector2::zeros();
+    for first in 0..SLICES {
+        let sum: Vector2<f32> = (first..first + WINDOW).map(|k| slices[k % SLICES]).sum();
+        if sum.norm_squared() > longest.norm_squared() {
+            longest = sum;
+        }
+    }
+    longest.try_normalize(0.0).unwrap_or(Vector2::x())
+}
+
+/// The angle of a vector as a share of a turn, in 0..=1, to a hundred-thousandth: a polynomial that
+/// many lanes can compute at once.
+#[inline(always)]
+fn turn(x: f32, y: f32) -> f32 {
+    let (long, short) = (x.abs().max(y.abs()), x.abs().min(y.abs()));
+    let t = short / long.max(f32::MIN_POSITIVE);
+    let s = t * t;
+    let polynomial = 0.052_653_32 - s * 0.011_721_2;
+    let polynomial = -0.116_432_87 + s * polynomial;
+    let polynomial = 0.193_543_46 + s * polynomial;
+    let polynomial = -0.332_623_47 + s * polynomial;
+    let octant = t * (0.999_977_26 + s * polynomial);
+    let quadrant = if y.abs() > x.abs() {
+        FRAC_PI_2 - octant
+    } else {
+        octant
     };
-    (0..SLICES)
-        .map(window)
-        .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))
-        .and_then(|sum| sum.try_normalize(0.0))
-        .unwrap_or(Vector2::x())
+    let half = if x < 0.0 { PI - quadrant } else { quadrant };
+    (if y < 0.0 { TAU - half } else { half }) / TAU
 }
 
 /// Brightness and its derivatives along and across the orientation, on a lattice that turns with it.
-fn sample(level: &Level, peak: &Peak, along: Vector2<f32>) -> [[f32; SIDE * SIDE]; 3] {
-    let (width, height) = (level.image.width() as i32, level.image.height() as i32);
-    let [image, dx, dy] =
-        [&level.image, &level.gradient[0], &level.gradient[1]].map(|p| p.as_raw());
+#[inline(always)]
+fn sample(level: &Level, peak: &Peak, along: Vector2<f32>) -> [Samples; 3] {
+    let (right, bottom) = (
+        level.image.width() as i32 - 1,
+        level.image.height() as i32 - 1,
+    );
     let step = level.spacing as f32 * along;
-    let mut samples = [[0.0; SIDE * SIDE]; 3];
-    for k in 0..SIDE * SIDE {
-        let i = ((k % SIDE) as i32 - RADIUS) as f32;
-        let j = ((k / SIDE) as i32 - RADIUS) as f32;
-        let x = (peak.at.x + i * step.x - j * step.y + 0.5) as i32;
-        let y = (peak.at.y + i * step.y + j * step.x + 0.5) as i32;
-        let at = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize;
-        samples[0][k] = image[at];
-        samples[1][k] = along.x * dx[at] + along.y * dy[at];
-        samples[2][k] = along.x * dy[at] - along.y * dx[at];
+    let mut places = [0i32; SIDE * SIDE];
+    for (row, j) in places.chunks_exact_mut(SIDE).zip(-RADIUS..) {
+        let (x, y) = (peak.at.x - j as f32 * step.y, peak.at.y + j as f32 * step.x);
+        for (k, place) in row.iter_mut().enumerate() {
+            let i = (k as i32 - RADIUS) as f32;
+            let (x, y) = ((x + i * step.x + 0.5) as i32, (y + i * step.y + 0.5) as i32);
+            *place = y.clamp(0, bottom) * (right + 1) + x.clamp(0, right);
+        }
+    }
+    let planes = [&level.image, &level.gradient[0], &level.gradient[1]];
+    let mut samples = planes.map(|plane| {
+        let pixels = plane.as_raw().as_slice();
+        places.map(|place| pixels[place as usize])
+    });
+    let [_, dx, dy] = &mut samples;
+    for (x, y) in dx.iter_mut().zip(dy) {
+        (*x, *y) = (along.x * *x + along.y * *y, along.x * *y - along.y * *x);
     }
     samples
 }
 
-/// The sum of the samples in each cell of a grid that begins at the lattice's first corner; means
-/// compare as sums do.
-fn cell_sums(samples: &[f32; SIDE * SIDE], cells: usize, side: usize) -> [f32; 16] {
-    let mut sums = [0.0; 16];
+/// The sum of the samples in each cell of a grid that begins at the lattice's first corner: `cells`
+/// along each side, of `side` samples each. Sums compare as means do.
+#[inline(always)]
+fn cell_sums<const N: usize>(samples: &Samples, cells: usize, side: usize) -> [f32; N] {
+    let mut sums = [0.0; N];
     for cy in 0..cells {
-        let columns: [f32; SIDE] = from_fn(|x| {
-            let rows = cy * side..(cy + 1) * side;
-            rows.map(|y| samples[y * SIDE + x]).sum()
-        });
+        let mut columns = [0.0; SIDE];
+        for row in samples.chunks_exact(SIDE).skip(cy * side).take(side) {
+            for x in 0..SIDE {
+                columns[x] += row[x];
+            }
+        }
         for cx in 0..cells {
             sums[cy * cells + cx] = columns[cx * side..(cx + 1) * side].iter().sum();
         }
     }
     sums
+}
+
+/// A bit for each pair of cells: whether the first has more.
+#[inline(always)]
+fn compare<const N: usize>(sums: &[f32; N], bits: &mut Bits) {
+    for i in 0..N - 1 {
+        let mut more = 0;
+        for j in 0..N {
+            more |= u64::from(sums[i] > sums[j]) << j;
+        }
+        bits.push(more >> (i + 1), N - 1 - i);
+    }
+}
+
+/// Bits written one after another, from the lowest of the first word on.
+#[derive(Default)]
+struct Bits {
+    words: [u64; 8],
+    count: usize,
+}
+
+impl Bits {
+    /// Adds the lowest `count` bits of a word whose others are zero.
+    #[inline(always)]
+    fn push(&mut self, bits: u64, count: usize) {
+        let (word, shift) = (self.count / 64, self.count % 64);
+        self.words[word] |= bits << shift;
+        if shift + count > 64 {
+            self.words[word + 1] |= bits >> (64 - shift);
+        }
+        self.count += count;
+    }
+
+    fn bytes(&self) -> Descriptor {
+        let mut bytes = [0; 64];
+        for (bytes, word) in bytes.chunks_exact_mut(8).zip(self.words) {
+            bytes.copy_from_slice(&word.to_le_bytes());
+        }
+        bytes
+    }
 }

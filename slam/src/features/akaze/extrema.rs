@@ -19,8 +19,8 @@ pub(super) struct Peak {
 }
 
 /// Peaks above `threshold` whose descriptor, which reaches `reach` times the spacing of their level,
-/// lies inside the image; the strongest first. Of peaks that overlap in one level or in neighbouring
-/// ones the strongest is left.
+/// lies inside the image; the strongest first. A peak that a stronger one overlaps, in its level or in a
+/// neighbouring one, is none.
 pub(super) fn find_peaks(levels: &[Level], threshold: f32, reach: f32) -> Vec<Peak> {
     let mut peaks: Vec<Peak> = levels
         .par_iter()
@@ -29,8 +29,12 @@ pub(super) fn find_peaks(levels: &[Level], threshold: f32, reach: f32) -> Vec<Pe
         .collect();
     // Levels and rows decide between equals, so that the order is always the same.
     peaks.sort_by(|a, b| b.response.total_cmp(&a.response));
-    let mut kept = Occupied::new(levels);
-    peaks.retain(|peak| kept.takes(peak));
+    let mut stronger = Places::new(levels);
+    peaks.retain(|peak| {
+        let overlapped = stronger.overlap(peak);
+        stronger.add(peak);
+        !overlapped
+    });
     peaks.retain_mut(|peak| match refine(&levels[peak.level].response, peak.at) {
         Some(at) => {
             peak.at = at;
@@ -67,8 +71,8 @@ fn local_maxima(index: usize, level: &Level, threshold: f32, reach: f32) -> Vec<
     maxima
 }
 
-/// The peaks of each level by place, for asking whether a stronger one overlaps.
-struct Occupied {
+/// Peaks of each level by place.
+struct Places {
     levels: Vec<Cells>,
 }
 
@@ -82,7 +86,7 @@ struct Cells {
     cells: Vec<Vec<Vector2<f32>>>,
 }
 
-impl Occupied {
+impl Places {
     fn new(levels: &[Level]) -> Self {
         let cells = |level: &Level| {
             let size = level.ratio * level.spacing as f32;
@@ -101,21 +105,20 @@ impl Occupied {
         }
     }
 
-    /// Takes a peak in, unless one is there within the size of the larger of both.
-    fn takes(&mut self, peak: &Peak) -> bool {
+    /// Whether a peak of the same or of a neighbouring level lies within the size of the larger one.
+    fn overlap(&self, peak: &Peak) -> bool {
         let own = &self.levels[peak.level];
-        let (at, size) = (peak.at * own.ratio, own.size);
         let neighbours = peak.level.saturating_sub(1)..(peak.level + 2).min(self.levels.len());
-        if self.levels[neighbours]
+        self.levels[neighbours]
             .iter()
-            .any(|l| l.holds_near(at, size))
-        {
-            return false;
-        }
+            .any(|l| l.holds_near(peak.at * own.ratio, own.size))
+    }
+
+    fn add(&mut self, peak: &Peak) {
         let own = &mut self.levels[peak.level];
+        let at = peak.at * own.ratio;
         let cell = own.cell(at.y, own.rows) * own.columns + own.cell(at.x, own.columns);
         own.cells[cell].push(at);
-        true
     }
 }
 

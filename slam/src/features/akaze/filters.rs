@@ -263,14 +263,19 @@ fn diffuse_row(
     let n = out.len();
     let (above, here, below) = (&above[..n], &here[..n], &below[..n]);
     let (c_above, c_here, c_below) = (&c_above[..n], &c_here[..n], &c_below[..n]);
-    let flow = |x: usize, to: f32, c_to: f32| (c_here[x] + c_to) * (to - here[x]);
-    let vertical = |x: usize| flow(x, above[x], c_above[x]) + flow(x, below[x], c_below[x]);
-    let to = |x: usize, side: usize| flow(x, here[side], c_here[side]);
     for x in 1..n.max(1) - 1 {
-        out[x] = here[x] + half_tau * (vertical(x) + to(x, x - 1) + to(x, x + 1));
+        let (value, c) = (here[x], c_here[x]);
+        let vertical =
+            (c + c_above[x]) * (above[x] - value) + (c + c_below[x]) * (below[x] - value);
+        let left = (c + c_here[x - 1]) * (here[x - 1] - value);
+        let right = (c + c_here[x + 1]) * (here[x + 1] - value);
+        out[x] = value + half_tau * (vertical + left + right);
     }
-    for x in [0, n - 1] {
-        let sides = to(x, x.saturating_sub(1)) + to(x, (x + 1).min(n - 1));
-        out[x] = here[x] + half_tau * (vertical(x) + sides);
+    for (x, inner) in [(0, 1.min(n - 1)), (n - 1, n.max(2) - 2)] {
+        let (value, c) = (here[x], c_here[x]);
+        let vertical =
+            (c + c_above[x]) * (above[x] - value) + (c + c_below[x]) * (below[x] - value);
+        let side = (c + c_here[inner]) * (here[inner] - value);
+        out[x] = value + half_tau * (vertical + side);
     }
 }

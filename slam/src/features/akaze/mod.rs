@@ -34,7 +34,9 @@ impl FeatureDetector for Akaze {
         }
         let levels = scale_space(grey);
         let peaks = find_peaks(&levels, self.threshold, descriptor::REACH);
-        let peaks = spread(peaks, &levels, self.most);
+        let mut peaks = spread(peaks, &levels, self.most);
+        // Neighbours in the image are neighbours in memory.
+        peaks.sort_by_key(|p| (p.level, p.at.y as u32, p.at.x as u32));
         Ok(Features {
             keypoints: peaks
                 .iter()

@@ -115,7 +115,11 @@ fn contrast_factor(smooth: &Plane) -> f32 {
     /// Of a blank image.
     const NONE: f32 = 0.03;
     let [dx, dy] = gradient(smooth, 1);
-    let lengths: Vec<f32> = dx.iter().zip(dy.iter()).map(|(x, y)| x.hypot(*y)).collect();
+    let lengths: Vec<f32> = dx
+        .iter()
+        .zip(dy.iter())
+        .map(|(x, y)| (x * x + y * y).sqrt())
+        .collect();
     let largest = lengths.iter().copied().fold(0.0, f32::max);
     if largest <= 0.0 {
         return NONE;
