@@ -70,4 +70,13 @@ pub enum EvalError {
         /// Frames compared.
         frames: usize,
     },
+    /// No place is known to both sides.
+    #[error(
+        "the estimate knows none of the {truth} places of the truth in its extent\n  \
+         cure: give both in one frame; `barchan map --align` takes a map to the frame of known poses"
+    )]
+    NoOverlap {
+        /// Places of known truth in the extent of the estimate.
+        truth: usize,
+    },
 }

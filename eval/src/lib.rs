@@ -1,7 +1,8 @@
 //! Scores: how far an estimate lies from the truth, by the definitions the field uses.
 //!
-//! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors) and
-//! [`disparity`] (end-point error, bad pixels, density).
+//! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
+//! [`disparity`] (end-point error, bad pixels, density) and [`elevation`] (differences of heights,
+//! whether stated bounds hold).
 //!
 //! What it promises: scores serialise to the JSON keys of the command line; a score is made of at
 //! least one comparison, so no figure is a division by zero; input that cannot be compared gives an
@@ -10,9 +11,11 @@
 //! What it never does: read a file, run an engine, or repair an estimate before judging it.
 
 pub mod disparity;
+pub mod elevation;
 mod error;
 pub mod trajectory;
 
 pub use disparity::{DisparityFigures, DisparityScore, DisparityTally};
+pub use elevation::{BoundsScore, ComparedCell, ElevationScore};
 pub use error::EvalError;
 pub use trajectory::{SegmentScore, Similarity, TrajectoryScore};

@@ -73,7 +73,7 @@ where
     /// # Errors
     /// As [`write_geotiff`].
     pub fn write(&self, path: &Path) -> Result<(), TerrainError> {
-        write_geotiff(path, &self.grid, self.crs.as_ref(), &[&self.values])
+        write_geotiff(path, &self.grid, self.crs.as_ref(), &[("", &self.values)])
     }
 }
 
@@ -142,7 +142,8 @@ impl<T: Sample> Raster<T> {
 }
 
 /// Writes a GeoTIFF: deflate, cells as areas, north up, "no data" declared (-9999 for `f32`, where
-/// NaN stands in memory; 0 for `u8`). Without a `crs` the file declares a local frame in metres.
+/// NaN stands in memory; 0 for `u8`). Without a `crs` the file declares a local frame in metres. Each
+/// band has a name, which QGIS and gdalinfo show; an empty one is not written.
 ///
 /// # Errors
 /// When the file cannot be written (an older one of that name then stays as it was), or a band has
@@ -151,7 +152,7 @@ pub fn write_geotiff<T: Sample>(
     path: &Path,
     grid: &Grid,
     crs: Option<&Crs>,
-    bands: &[&[T]],
+    bands: &[(&str, &[T])],
 ) -> Result<(), TerrainError>
 where
     [T]: TiffValue,
@@ -161,7 +162,7 @@ where
         message,
     };
     let cells = grid.width * grid.height;
-    if bands.is_empty() || bands.iter().any(|b| b.len() != cells) {
+    if bands.is_empty() || bands.iter().any(|b| b.1.len() != cells) {
         return Err(bad(format!(
             "every band of the raster must hold {cells} values"
         )));
@@ -172,7 +173,7 @@ where
         ));
     };
     let interleaved: Vec<T> = (0..cells)
-        .flat_map(|i| bands.iter().map(move |b| b[i].to_file()))
+        .flat_map(|i| bands.iter().map(move |b| b.1[i].to_file()))
         .collect();
     let local = Crs::local();
     let crs = crs.unwrap_or(&local);
@@ -200,6 +201,10 @@ where
             if !crs.ascii.is_empty() {
                 tags.write_tag(Tag::GeoAsciiParamsTag, crs.ascii.as_str())?;
             }
+            let names = band_names(bands.iter().map(|b| b.0));
+            if !names.is_empty() {
+                tags.write_tag(GDAL_METADATA, names.as_str())?;
+            }
             tags.write_tag(Tag::GdalNodata, T::NODATA)?;
             image.write_data(&interleaved)
         };
@@ -211,6 +216,24 @@ where
             other => bad(other.to_string()),
         })
     })
+}
+
+/// Where GDAL keeps what TIFF has no tag for, as XML.
+const GDAL_METADATA: Tag = Tag::Unknown(42112);
+
+/// The names of bands as GDAL writes them; empty without any. Names are of this program: plain words.
+fn band_names<'a>(names: impl Iterator<Item = &'a str>) -> String {
+    let items: String = names
+        .enumerate()
+        .filter(|(_, name)| !name.is_empty())
+        .map(|(k, name)| {
+            format!("<Item name=\"DESCRIPTION\" sample=\"{k}\" role=\"description\">{name}</Item>")
+        })
+        .collect();
+    if items.is_empty() {
+        return items;
+    }
+    format!("<GDALMetadata>{items}</GDALMetadata>")
 }
 
 impl Crs {
@@ -382,12 +405,19 @@ mod tests {
         let path = dir.path().join("bands.tif");
         let dem = relief(31, 17);
         let other = vec![5.0f32; 31 * 17];
-        write_geotiff(&path, &dem.grid, None, &[&dem.values, &other, &other]).unwrap();
+        let bands: [(&str, &[f32]); 3] = [("height", &dem.values), ("", &other), ("five", &other)];
+        write_geotiff(&path, &dem.grid, None, &bands).unwrap();
         assert!(same(
             &Raster::<f32>::read(&path).unwrap().values,
             &dem.values
         ));
-        assert!(write_geotiff(&path, &dem.grid, None, &[&dem.values, &other[1..]]).is_err());
+        let text = Command::new("gdalinfo").arg(&path).output();
+        if let Ok(text) = text.map(|out| String::from_utf8_lossy(&out.stdout).into_owned()) {
+            let described = |name| text.contains(&format!("Description = {name}"));
+            assert!(described("height") && described("five"), "{text}");
+        }
+        let short = [("", &dem.values[..]), ("", &other[1..])];
+        assert!(write_geotiff(&path, &dem.grid, None, &short).is_err());
     }
 
     #[test]

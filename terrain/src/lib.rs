@@ -1,7 +1,8 @@
 //! Terrain out of disparity: clouds, voxels, digital elevation models, shaded relief and their files.
 //!
 //! What it is for: [`map_keyframes`] turns key frames with disparity into a coloured voxel cloud, a
-//! DEM and a hillshade, as Hong 2021, 3.2.2 and 4.3 do; its parts ([`Cloud`], [`VoxelMap`],
+//! DEM and a hillshade, as Hong 2021, 3.2.2 and 4.3 do; [`elevation`] keeps heights with their
+//! uncertainty (Bai 2019); its parts ([`Cloud`], [`VoxelMap`],
 //! [`level()`], [`Raster`], [`hillshade()`], PLY and GeoTIFF files) serve alone as well.
 //!
 //! What it promises: metres; z up in everything levelled; rasters north-up, whose rows run south;
@@ -12,6 +13,7 @@
 
 mod atomic;
 mod cloud;
+pub mod elevation;
 mod error;
 mod geotiff;
 mod hillshade;
@@ -26,6 +28,9 @@ pub use error::TerrainError;
 pub use geotiff::{Crs, Sample, write_geotiff};
 pub use hillshade::{Light, hillshade};
 pub use level::{Levelled, level};
-pub use map::{DenseKeyframe, Levelling, MapConfig, TerrainMap, map_keyframes};
+pub use map::{
+    DenseKeyframe, Levelling, MapConfig, StereoErrors, TerrainMap, elevation_of_keyframes,
+    map_keyframes,
+};
 pub use raster::{CellStatistic, Dem, Grid, NODATA, Raster, dem};
 pub use voxel::{Voxel, VoxelMap};

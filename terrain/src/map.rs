@@ -1,21 +1,27 @@
 use barchan_datasets::{Plane, Rgb};
 use barchan_geometry::{RectifiedRig, Se3};
-use nalgebra::Point3;
+use nalgebra::{Matrix6, Point3};
 use serde::{Deserialize, Serialize};
 
+use crate::elevation::{ElevationConfig, ElevationMap, Scan, SensorModel};
 use crate::error::positive;
 use crate::raster::dem;
 use crate::{
-    CellStatistic, Cloud, DepthLimits, Light, Raster, TerrainError, Voxel, VoxelMap, hillshade,
-    level,
+    CellStatistic, Cloud, Dem, DepthLimits, Light, Raster, TerrainError, Voxel, VoxelMap,
+    hillshade, level,
 };
 
 /// A key frame whose disparity is known.
 #[derive(Clone, Debug)]
 #[allow(non_snake_case)]
 pub struct DenseKeyframe {
+    /// Seconds.
+    pub time: f64,
     /// Maps points of the left camera frame to the world.
     pub T_world_cam: Se3,
+    /// Covariance of that pose, of its position and of its rotation vector, both about the axes of the
+    /// world; `None` where nobody knows.
+    pub pose_covariance: Option<Matrix6<f64>>,
     /// The left image, which gives the colours.
     pub left: Rgb,
     /// Disparity of the left image, pixels; NaN is unknown.
@@ -80,8 +86,8 @@ impl Default for MapConfig {
 pub struct TerrainMap {
     /// Voxels of enough points, in a fixed order.
     pub voxels: Vec<Voxel>,
-    /// Elevation, metres.
-    pub dem: Raster<f32>,
+    /// Elevation, count and spread.
+    pub dem: Dem,
     /// The DEM, shaded.
     pub hillshade: Raster<u8>,
     /// Maps points of the world to the frame of all the above: z up.
@@ -198,7 +204,7 @@ pub fn map_keyframes<E: From<TerrainError>>(
     }
     Ok(TerrainMap {
         hillshade: hillshade(&dem.raster, &config.light),
-        dem: dem.raster,
+        dem,
         T_level_world: levelled,
         keyframes: count,
         points,
@@ -207,6 +213,71 @@ pub fn map_keyframes<E: From<TerrainError>>(
         voxels,
         notices,
     })
+}
+
+/// How the sensor of key frames may be off, where their disparity does not say it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StereoErrors {
+    /// Deviation of where in the image a disparity belongs, pixels. Default 1: matching looks at
+    /// windows.
+    pub pixel: f64,
+    /// Deviation of the disparity's error that all looks at a place share, pixels. Default 0.15: a
+    /// calibration, and a preference of matching for some fractions of a pixel.
+    pub systematic: f64,
+}
+
+impl Default for StereoErrors {
+    fn default() -> Self {
+        Self {
+            pixel: 1.0,
+            systematic: 0.15,
+        }
+    }
+}
+
+/// Makes an elevation map of key frames, one at a time, in the frame that `T_level_world` maps the world
+/// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> covariance of points -> with that of
+/// the pose -> variance of heights ([`ElevationMap::add`]).
+///
+/// # Errors
+/// The first error of `keyframes`; when images and rig differ in size, a setting makes no sense, or
+/// the map would be absurdly large.
+#[allow(non_snake_case)]
+pub fn elevation_of_keyframes<E: From<TerrainError>>(
+    keyframes: impl IntoIterator<Item = Result<DenseKeyframe, E>>,
+    rig: &RectifiedRig,
+    T_level_world: &Se3,
+    limits: &DepthLimits,
+    errors: &StereoErrors,
+    config: &ElevationConfig,
+) -> Result<ElevationMap, E> {
+    let sensor = SensorModel::Stereo {
+        focal: rig.fx,
+        baseline: rig.baseline,
+        pixel: errors.pixel,
+        systematic: errors.systematic,
+    };
+    // How the levelled frame's axes lie to the world's, for shift and rotation alike.
+    let rotation = T_level_world.rotation.to_rotation_matrix();
+    let mut turn = Matrix6::zeros();
+    turn.fixed_view_mut::<3, 3>(0, 0)
+        .copy_from(rotation.matrix());
+    turn.fixed_view_mut::<3, 3>(3, 3)
+        .copy_from(rotation.matrix());
+    let mut map = ElevationMap::new(*config)?;
+    for keyframe in keyframes {
+        let k = keyframe?;
+        let cloud = Cloud::from_disparity(rig, &k.left, &k.disparity, k.sigma.as_ref(), limits)?;
+        map.add_growing(&Scan {
+            cloud: &cloud,
+            T_map_sensor: T_level_world * k.T_world_cam,
+            pose_covariance: k.pose_covariance.map(|c| turn * c * turn.transpose()),
+            sensor,
+            time: k.time,
+        })?;
+    }
+    Ok(map)
 }
 
 /// See [`MapConfig::voxel`].
@@ -297,7 +368,9 @@ mod tests {
     ) -> Result<DenseKeyframe, TerrainError> {
         let disparity = render(rig, &T_world_cam, f);
         Ok(DenseKeyframe {
+            time: 0.0,
             T_world_cam,
+            pose_covariance: None,
             left: grey(rig),
             disparity,
             sigma: None,
@@ -326,6 +399,7 @@ mod tests {
         let map = map_keyframes(frames, &rig, &fine()).unwrap();
         let known: Vec<f32> = map
             .dem
+            .raster
             .values
             .iter()
             .copied()
@@ -360,11 +434,11 @@ mod tests {
         };
         let map = map_keyframes(frames, &rig, &config).unwrap();
         let (mut low, mut high) = (0, 0);
-        for row in 0..map.dem.grid.height {
-            for column in 0..map.dem.grid.width {
+        for row in 0..map.dem.raster.grid.height {
+            for column in 0..map.dem.raster.grid.width {
                 let ((x, _), z) = (
-                    map.dem.grid.centre(column, row),
-                    f64::from(map.dem.at(column, row)),
+                    map.dem.raster.grid.centre(column, row),
+                    f64::from(map.dem.raster.at(column, row)),
                 );
                 // Cells that the edge runs through, or that see its riser, hold both heights.
                 if z.is_nan() || (x - 1.2).abs() < 0.05 {
@@ -402,9 +476,16 @@ mod tests {
             },
         )
         .unwrap();
-        let near: Vec<f64> = (0..map.dem.values.len())
-            .filter(|i| map.dem.grid.centre(i % map.dem.grid.width, 0).0 < 1.0)
-            .map(|i| f64::from(map.dem.values[i]))
+        let near: Vec<f64> = (0..map.dem.raster.values.len())
+            .filter(|i| {
+                map.dem
+                    .raster
+                    .grid
+                    .centre(i % map.dem.raster.grid.width, 0)
+                    .0
+                    < 1.0
+            })
+            .map(|i| f64::from(map.dem.raster.values[i]))
             .filter(|z| z.is_finite())
             .collect();
         let rmse = (near.iter().map(|z| z * z).sum::<f64>() / near.len() as f64).sqrt();

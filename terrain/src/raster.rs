@@ -1,8 +1,10 @@
+use std::path::Path;
+
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use crate::error::positive;
-use crate::geotiff::Crs;
+use crate::geotiff::{Crs, write_geotiff};
 use crate::{TerrainError, Voxel};
 
 /// "No data" in files of `f32` (in memory it is NaN).
@@ -46,6 +48,10 @@ pub enum CellStatistic {
     Mean,
     /// Their median: keeps a stray point from moving a cell.
     Median,
+    /// The height that a tenth of them lie below: the ground between stones and under twigs.
+    P10,
+    /// The highest: what a wheel or a belly meets first.
+    Max,
 }
 
 /// A digital elevation model and what was left out of it.
@@ -53,8 +59,28 @@ pub enum CellStatistic {
 pub struct Dem {
     /// Elevation, metres; NaN where no point fell. Nothing is filled in.
     pub raster: Raster<f32>,
+    /// Points of each cell, 0 where none fell; in the order of the raster.
+    pub count: Vec<f32>,
+    /// Standard deviation of the heights of each cell's voxels, by their points, metres; NaN where
+    /// none fell.
+    pub spread: Vec<f32>,
     /// Points that lie far outside the extent of all others and were left out.
     pub outliers: usize,
+}
+
+impl Dem {
+    /// Writes a GeoTIFF of three bands: elevation, count, spread.
+    ///
+    /// # Errors
+    /// As [`write_geotiff`].
+    pub fn write(&self, path: &Path) -> Result<(), TerrainError> {
+        let bands: [(&str, &[f32]); 3] = [
+            ("elevation", &self.raster.values),
+            ("count", &self.count),
+            ("spread", &self.spread),
+        ];
+        write_geotiff(path, &self.raster.grid, self.raster.crs.as_ref(), &bands)
+    }
 }
 
 impl Grid {
@@ -146,11 +172,21 @@ pub fn dem(
         })
         .collect();
     heights.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut values = vec![f32::NAN; grid.width * grid.height];
+    let cells = grid.width * grid.height;
+    let (mut values, mut spread) = (vec![f32::NAN; cells], vec![f32::NAN; cells]);
+    let mut count = vec![0.0; cells];
     for cell in heights.chunk_by(|a, b| a.0 == b.0) {
-        values[cell[0].0] = match statistic {
-            CellStatistic::Mean => mean(cell),
-            CellStatistic::Median => median(cell),
+        let index = cell[0].0;
+        let mean = mean(cell);
+        let weight: f64 = cell.iter().map(|h| h.2).sum();
+        let squares: f64 = cell.iter().map(|h| h.2 * (h.1 - mean).powi(2)).sum();
+        count[index] = weight as f32;
+        spread[index] = (squares / weight).sqrt() as f32;
+        values[index] = match statistic {
+            CellStatistic::Mean => mean,
+            CellStatistic::Median => quantile(cell, 0.5),
+            CellStatistic::P10 => quantile(cell, 0.1),
+            CellStatistic::Max => cell[cell.len() - 1].1,
         } as f32;
     }
     Ok(Dem {
@@ -159,6 +195,8 @@ pub fn dem(
             crs: None,
             values,
         },
+        count,
+        spread,
         outliers: voxels.len() - kept.len(),
     })
 }
@@ -180,16 +218,17 @@ fn mean(heights: &[(usize, f64, f64)]) -> f64 {
     heights.iter().map(|h| h.1 * h.2).sum::<f64>() / weight
 }
 
-/// Weighted median of heights in ascending order; between two values that halve the weight, their mean.
-fn median(heights: &[(usize, f64, f64)]) -> f64 {
-    let half = 0.5 * heights.iter().map(|h| h.2).sum::<f64>();
+/// The height that a share of the weight lies below, of heights in ascending order; where the share
+/// ends between two, their mean.
+fn quantile(heights: &[(usize, f64, f64)], share: f64) -> f64 {
+    let wanted = share * heights.iter().map(|h| h.2).sum::<f64>();
     let mut below = 0.0;
     for (i, h) in heights.iter().enumerate() {
         below += h.2;
-        if below > half || i + 1 == heights.len() {
+        if below > wanted || i + 1 == heights.len() {
             return h.1;
         }
-        if below == half {
+        if below == wanted {
             return 0.5 * (h.1 + heights[i + 1].1);
         }
     }
@@ -243,6 +282,14 @@ mod tests {
             (median.at(0, 0), median.at(1, 0), median.at(1, 1)),
             (4.0, -2.0, 6.0)
         );
+        let p10 = dem(&voxels, 1.0, CellStatistic::P10, 100).unwrap();
+        assert_eq!((p10.raster.at(0, 0), p10.raster.at(1, 1)), (1.0, 5.0));
+        let max = dem(&voxels, 1.0, CellStatistic::Max, 100).unwrap();
+        assert_eq!((max.raster.at(0, 0), max.raster.at(1, 1)), (9.0, 7.0));
+        // Count and spread do not depend on the statistic.
+        assert_eq!(max.count, [5.0, 7.0, 0.0, 2.0]);
+        assert!((max.spread[0] - 6.64f32.sqrt()).abs() < 1e-6 && max.spread[2].is_nan());
+        assert_eq!((max.spread[1], max.spread[3]), (0.0, 1.0));
     }
 
     #[test]

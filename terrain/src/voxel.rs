@@ -50,7 +50,7 @@ impl VoxelMap {
             let Some(key) = self.key(&p.position) else {
                 continue;
             };
-            let rgb = Vector3::from(p.colour.map(|c| SRGB_TO_LINEAR[usize::from(c)]));
+            let rgb = Vector3::from(p.colour.map(srgb_to_linear));
             let empty = Voxel {
                 count: 0,
                 mean: p.position,
@@ -129,8 +129,13 @@ static SRGB_TO_LINEAR: LazyLock<[f64; 256]> = LazyLock::new(|| {
     })
 });
 
+/// IEC 61966-2-1.
+pub(crate) fn srgb_to_linear(level: u8) -> f64 {
+    SRGB_TO_LINEAR[usize::from(level)]
+}
+
 /// IEC 61966-2-1, to the nearest of 256 levels.
-fn linear_to_srgb(linear: f64) -> u8 {
+pub(crate) fn linear_to_srgb(linear: f64) -> u8 {
     let s = if linear <= 0.0031308 {
         12.92 * linear
     } else {
