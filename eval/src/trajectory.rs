@@ -4,7 +4,7 @@
 //! Truth may hold positions only (planar survey points carry no rotation). It is recognised by all
 //! its rotations being the same, and then no figure uses a true rotation: see [`TrajectoryScore`].
 
-use barchan_geometry::nalgebra::{Matrix3, Rotation3, Vector3};
+use barchan_geometry::nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use serde::Serialize;
 
@@ -274,6 +274,41 @@ pub fn umeyama(
         rotation,
         translation,
     })
+}
+
+/// The rigid motion `T_truth_est` that brings an estimated trajectory nearest to another, by positions
+/// and, where the other has rotations, by three points a metre along the axes of each camera, which
+/// settle the rotation of a straight drive too.
+///
+/// # Errors
+/// As [`associate`] and [`umeyama`].
+pub fn align(estimate: &Trajectory, truth: &Trajectory, tolerance: f64) -> Result<Se3, EvalError> {
+    let pairs = associate(estimate, truth, tolerance)?;
+    let axes: &[Vector3<f64>] = match holds_positions_only(&pairs.T_world_cam_true) {
+        true => &[],
+        false => &[
+            Vector3::new(1.0, 0.0, 0.0),
+            Vector3::new(0.0, 1.0, 0.0),
+            Vector3::new(0.0, 0.0, 1.0),
+        ],
+    };
+    let points = |poses: &[Se3]| -> Vec<Vector3<f64>> {
+        let around = |p: &Se3| -> Vec<Vector3<f64>> {
+            let centre = p.translation.vector;
+            let along = axes.iter().map(|a| centre + p.rotation * a);
+            std::iter::once(centre).chain(along).collect()
+        };
+        poses.iter().flat_map(around).collect()
+    };
+    let found = umeyama(
+        &points(&pairs.T_world_cam_est),
+        &points(&pairs.T_world_cam_true),
+        false,
+    )?;
+    Ok(Se3::from_parts(
+        found.translation.into(),
+        UnitQuaternion::from_rotation_matrix(&found.rotation),
+    ))
 }
 
 /// Whether a trajectory carries no rotation: all are the same.

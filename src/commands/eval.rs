@@ -4,7 +4,9 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, open, read_planar};
 use barchan_eval::disparity::DisparityTally;
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
+use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::Trajectory;
+use barchan_terrain::Raster;
 use clap::{Parser, Subcommand};
 
 use crate::output::Output;
@@ -13,6 +15,7 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan eval trajectory --est runs/s/trajectory.tum --gt images/gt.csv\n  \
+    barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif
     barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json")]
 pub struct Args {
     #[command(subcommand)]
@@ -42,11 +45,30 @@ enum What {
         #[arg(long, default_value_t = DEFAULT_TOLERANCE)]
         tolerance: f64,
     },
+    /// Elevations against true ones in the same frame, cell by cell; of `elevation.tif` also whether
+    /// its bounds hold
+    Dem {
+        /// The estimate: dem.tif or elevation.tif of `barchan map`, or any GeoTIFF
+        #[arg(long, value_name = "FILE")]
+        est: PathBuf,
+        /// The truth: a GeoTIFF. Where its cells are smaller, their mean over a cell of the estimate
+        /// counts; where larger, they are interpolated
+        #[arg(long = "ref", value_name = "FILE")]
+        reference: PathBuf,
+        /// Writes estimate less truth as a GeoTIFF
+        #[arg(long, value_name = "FILE")]
+        error_map: Option<PathBuf>,
+    },
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     match args.what {
         What::Disparity { pred, gt } => disparity(&pred, &gt, output),
+        What::Dem {
+            est,
+            reference,
+            error_map,
+        } => dem(&est, &reference, error_map.as_deref(), output),
         What::Trajectory { est, gt, tolerance } => trajectory(&est, &gt, tolerance, output),
     }
 }
@@ -91,6 +113,55 @@ fn disparity(pred: &Path, gt: &str, output: &Output) -> Result<()> {
         text += &line("estimated", estimated);
     }
     output.result(&score, &text)
+}
+
+fn dem(est: &Path, reference: &Path, error_map: Option<&Path>, output: &Output) -> Result<()> {
+    let bands = Raster::<f32>::read_bands(est)?;
+    let band = |name: &str| bands.iter().find(|(n, _)| n == name).map(|(_, b)| b);
+    let estimate = &bands[0].1;
+    let truth = Raster::<f32>::read(reference)?.onto(&estimate.grid);
+    let bounds = band("lower").zip(band("upper"));
+    let cells = (0..truth.values.len()).map(|i| ComparedCell {
+        estimate: estimate.values[i].into(),
+        truth: truth.values[i].into(),
+        bounds: bounds.map(|(low, high)| [low.values[i].into(), high.values[i].into()]),
+    });
+    let s = elevation::score(cells)
+        .with_context(|| format!("{} against {}", est.display(), reference.display()))?;
+    if let Some(path) = error_map {
+        let error = Raster {
+            values: estimate
+                .values
+                .iter()
+                .zip(&truth.values)
+                .map(|(e, t)| e - t)
+                .collect(),
+            ..truth.clone()
+        };
+        error.write(path)?;
+    }
+    let mut text = format!(
+        "cells            {} ({:.1} % of those in its extent)\nRMSE             {:.4} m\nmean             {:+.4} m\n\
+         50, 68, 95 %     {:.4} {:.4} {:.4} m\nlargest          {:.3} m\nwithin 0.5 m     {:.2} %",
+        s.cells,
+        100.0 * s.known,
+        s.rmse,
+        s.mean,
+        s.p50,
+        s.p68,
+        s.p95,
+        s.max,
+        100.0 * s.within_half_metre
+    );
+    if let Some(b) = &s.bounds {
+        text += &format!(
+            "\nbounds hold      {:.2} % (99.73 % is what three deviations promise)\nbounds, width    {:.4} m on average, {:.4} m half of them",
+            100.0 * b.coverage,
+            b.width,
+            b.width_p50
+        );
+    }
+    output.result(&s, &text)
 }
 
 fn trajectory(est: &Path, gt: &Path, tolerance: f64, output: &Output) -> Result<()> {

@@ -2,8 +2,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, read_rgb};
+use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
 use barchan_geometry::nalgebra::Matrix6;
-use barchan_geometry::{RectifiedRig, Rig, StampedPose, Trajectory};
+use barchan_geometry::{RectifiedRig, Rig, Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
     CellStatistic, DenseKeyframe, Levelling, MapConfig, StereoErrors, elevation_of_keyframes,
@@ -12,6 +13,7 @@ use barchan_terrain::{
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
 
+use crate::commands::eval::read_trajectory;
 use crate::output::{Output, StagedDir};
 
 /// Turn a SLAM run into terrain: voxel cloud, DEM, hillshade, elevation with bounds
@@ -48,6 +50,13 @@ pub struct Args {
     /// camera in a world whose z is up. The products are then in that world
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
+    /// Takes the map to the frame of these poses or places, by the rigid motion that fits the key frames
+    /// best: TUM text, KITTI text, gt.csv, or gnss.csv (the antenna is taken for the camera)
+    #[arg(long, value_name = "FILE", conflicts_with = "poses")]
+    align: Option<PathBuf>,
+    /// Removes what later key frames see through
+    #[arg(long)]
+    clear_ghosts: bool,
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -118,6 +127,15 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     if args.poses.is_some() {
         config.levelling = Levelling::World;
     }
+    if let Some(file) = &args.align {
+        let run = Trajectory {
+            poses: keyframes.iter().map(|k| k.pose).collect(),
+        };
+        let reference = read_places(file)?;
+        let motion = align(&run, &reference, DEFAULT_TOLERANCE)
+            .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
+        config.levelling = Levelling::Known(motion);
+    }
     let errors = StereoErrors {
         systematic: args.systematic,
         ..StereoErrors::default()
@@ -139,6 +157,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         &map.T_level_world,
         &config.limits,
         &errors,
+        args.clear_ghosts,
         &ElevationConfig {
             cell: map.cell,
             ..ElevationConfig::default()
@@ -208,6 +227,33 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// Poses, or places alone: what `barchan eval trajectory` reads, and `gnss.csv`.
+fn read_places(file: &Path) -> Result<Trajectory> {
+    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+    if !text.starts_with("time,x,y,z") {
+        return read_trajectory(file);
+    }
+    let mut poses = vec![];
+    for (number, line) in text.lines().enumerate().skip(1) {
+        let fields: Vec<f64> = line
+            .split(',')
+            .map_while(|f| f.trim().parse().ok())
+            .collect();
+        let [time, x, y, z, ..] = fields[..] else {
+            bail!(
+                "{}, line {}: expected time,x,y,z",
+                file.display(),
+                number + 1
+            );
+        };
+        poses.push(StampedPose {
+            time,
+            T_world_cam: Se3::translation(x, y, z),
+        });
+    }
+    Ok(Trajectory { poses })
 }
 
 /// Where the parts of a key frame lie.

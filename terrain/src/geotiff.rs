@@ -85,6 +85,15 @@ impl<T: Sample> Raster<T> {
     /// When the file cannot be read or is no TIFF, has no place on the ground (no geotransform), is
     /// rotated, or holds values that `T` does not.
     pub fn read(path: &Path) -> Result<Self, TerrainError> {
+        let mut bands = Self::read_bands(path)?;
+        Ok(bands.swap_remove(0).1)
+    }
+
+    /// Reads all bands, at least one, with their names as GDAL keeps them; empty where there is none.
+    ///
+    /// # Errors
+    /// As [`Raster::read`].
+    pub fn read_bands(path: &Path) -> Result<Vec<(String, Self)>, TerrainError> {
         let bad = |message: String| TerrainError::Raster {
             path: path.to_owned(),
             message,
@@ -111,6 +120,9 @@ impl<T: Sample> Raster<T> {
         let nodata: Option<f64> =
             nodata.and_then(|text| text.trim_end_matches('\0').trim().parse().ok());
 
+        let metadata = optional(tiff.get_tag_ascii_string(GDAL_METADATA)).map_err(damaged)?;
+        let metadata = metadata.unwrap_or_default();
+
         let stored = tiff.read_image().map_err(damaged)?;
         let (samples, single) =
             samples(stored).ok_or_else(|| bad("its number type is not supported".into()))?;
@@ -132,12 +144,17 @@ impl<T: Sample> Raster<T> {
                 ))
             })
         };
-        let values = samples
-            .into_iter()
-            .step_by(bands)
-            .map(value)
-            .collect::<Result<Vec<T>, _>>()?;
-        Ok(Self { grid, crs, values })
+        (0..bands)
+            .map(|k| {
+                let values = samples.iter().skip(k).step_by(bands).map(|v| value(*v));
+                let raster = Self {
+                    grid,
+                    crs: crs.clone(),
+                    values: values.collect::<Result<Vec<T>, _>>()?,
+                };
+                Ok((band_name(&metadata, k), raster))
+            })
+            .collect()
     }
 }
 
@@ -234,6 +251,18 @@ fn band_names<'a>(names: impl Iterator<Item = &'a str>) -> String {
         return items;
     }
     format!("<GDALMetadata>{items}</GDALMetadata>")
+}
+
+/// The name of band `k` in what [`band_names`] or GDAL wrote; empty where there is none.
+fn band_name(metadata: &str, k: usize) -> String {
+    let sample = format!("sample=\"{k}\"");
+    let items = metadata.split("<Item").skip(1);
+    let mut described = items.filter_map(|item| {
+        let (attributes, rest) = item.split_once('>')?;
+        let names = attributes.contains("role=\"description\"") && attributes.contains(&sample);
+        names.then(|| rest.split('<').next().unwrap_or_default().to_owned())
+    });
+    described.next().unwrap_or_default()
 }
 
 impl Crs {
@@ -411,6 +440,10 @@ mod tests {
             &Raster::<f32>::read(&path).unwrap().values,
             &dem.values
         ));
+        let read = Raster::<f32>::read_bands(&path).unwrap();
+        let names: Vec<&str> = read.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["height", "", "five"]);
+        assert!(same(&read[0].1.values, &dem.values) && same(&read[2].1.values, &other));
         let text = Command::new("gdalinfo").arg(&path).output();
         if let Ok(text) = text.map(|out| String::from_utf8_lossy(&out.stdout).into_owned()) {
             let described = |name| text.contains(&format!("Description = {name}"));

@@ -9,22 +9,29 @@
 //! NaN is "no data" in memory and -9999 in files; the same input gives the same output, bit by bit;
 //! memory bounded by the voxels, not by the length of a sequence; a file appears whole or not at all.
 //!
-//! What it never does: estimate poses or disparity, fill holes, or invent a coordinate system.
+//! What it never does: estimate poses or disparity, fill holes unasked, or invent a coordinate system.
 
 mod atomic;
 mod cloud;
+mod earthwork;
 pub mod elevation;
 mod error;
+mod fill;
 mod geotiff;
 mod hillshade;
 mod level;
 mod map;
+mod obstacles;
 mod ply;
 mod raster;
+mod rover;
+mod slope;
 mod voxel;
 
 pub use cloud::{Cloud, CloudPoint, DepthLimits};
+pub use earthwork::{Earthwork, earthwork};
 pub use error::TerrainError;
+pub use fill::{Filled, MAX_FILL, fill};
 pub use geotiff::{Crs, Sample, write_geotiff};
 pub use hillshade::{Light, hillshade};
 pub use level::{Levelled, level};
@@ -32,5 +39,8 @@ pub use map::{
     DenseKeyframe, Levelling, MapConfig, StereoErrors, TerrainMap, elevation_of_keyframes,
     map_keyframes,
 };
+pub use obstacles::{Obstacle, obstacles};
 pub use raster::{CellStatistic, Dem, Grid, NODATA, Raster, dem};
+pub use rover::{RoverLayers, RoverLimits, rover_layers};
+pub use slope::{roughness, slope};
 pub use voxel::{Voxel, VoxelMap};

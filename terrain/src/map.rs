@@ -31,7 +31,7 @@ pub struct DenseKeyframe {
 }
 
 /// What "up" is.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Levelling {
     /// The normal of the ground, see [`level()`].
@@ -39,6 +39,8 @@ pub enum Levelling {
     Ground,
     /// The z axis of the world: poses are gravity-aligned already. Nothing is moved.
     World,
+    /// This motion, which maps the world to a frame whose z is up: the run was aligned to something.
+    Known(Se3),
 }
 
 /// How key frames become terrain.
@@ -187,6 +189,7 @@ pub fn map_keyframes<E: From<TerrainError>>(
             levelled.T_level_world
         }
         Levelling::World => Se3::identity(),
+        Levelling::Known(known) => known,
     };
     for v in &mut voxels {
         v.mean = levelled * v.mean;
@@ -222,7 +225,7 @@ pub struct StereoErrors {
     /// Deviation of where in the image a disparity belongs, pixels. Default 1: matching looks at
     /// windows.
     pub pixel: f64,
-    /// Deviation of the disparity's error that all looks at a place share, pixels. Default 0.15: a
+    /// Deviation of the disparity's error that all looks at a place share, pixels. Default 0.1: a
     /// calibration, and a preference of matching for some fractions of a pixel.
     pub systematic: f64,
 }
@@ -231,14 +234,15 @@ impl Default for StereoErrors {
     fn default() -> Self {
         Self {
             pixel: 1.0,
-            systematic: 0.15,
+            systematic: 0.1,
         }
     }
 }
 
 /// Makes an elevation map of key frames, one at a time, in the frame that `T_level_world` maps the world
 /// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> covariance of points -> with that of
-/// the pose -> variance of heights ([`ElevationMap::add`]).
+/// the pose -> variance of heights ([`ElevationMap::add`]). With `clear_ghosts` what a key frame sees
+/// through is removed ([`ElevationMap::clear_ghosts`]).
 ///
 /// # Errors
 /// The first error of `keyframes`; when images and rig differ in size, a setting makes no sense, or
@@ -250,6 +254,7 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
     T_level_world: &Se3,
     limits: &DepthLimits,
     errors: &StereoErrors,
+    clear_ghosts: bool,
     config: &ElevationConfig,
 ) -> Result<ElevationMap, E> {
     let sensor = SensorModel::Stereo {
@@ -276,6 +281,9 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
             sensor,
             time: k.time,
         })?;
+        if clear_ghosts {
+            map.clear_ghosts(k.time);
+        }
     }
     Ok(map)
 }

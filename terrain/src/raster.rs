@@ -112,6 +112,67 @@ impl<T: Copy> Raster<T> {
     }
 }
 
+impl Raster<f32> {
+    /// Its values over the cells of another grid in the same frame. Onto cells at least twice as large:
+    /// the mean of the known cells whose centres lie in each, if they cover half of it. Else the
+    /// bilinear value between the four centres around. NaN where neither is known.
+    pub fn onto(&self, grid: &Grid) -> Self {
+        let ratio = [
+            grid.cell_x / self.grid.cell_x,
+            grid.cell_y / self.grid.cell_y,
+        ];
+        let cells = grid.width * grid.height;
+        let values = if ratio[0] >= 2.0 && ratio[1] >= 2.0 {
+            let (mut sums, mut counts) = (vec![0.0; cells], vec![0u32; cells]);
+            for (i, value) in self.values.iter().enumerate() {
+                let (x, y) = self.grid.centre(i % self.grid.width, i / self.grid.width);
+                if let (true, Some((c, r))) = (value.is_finite(), grid.cell_at(x, y)) {
+                    sums[r * grid.width + c] += f64::from(*value);
+                    counts[r * grid.width + c] += 1;
+                }
+            }
+            let enough = 0.5 * ratio[0] * ratio[1];
+            let mean = |(sum, count): (f64, u32)| match f64::from(count) >= enough {
+                true => (sum / f64::from(count)) as f32,
+                false => f32::NAN,
+            };
+            sums.into_iter().zip(counts).map(mean).collect()
+        } else {
+            let centre = |i: usize| grid.centre(i % grid.width, i / grid.width);
+            let values = (0..cells).map(centre);
+            values.map(|(x, y)| self.bilinear(x, y) as f32).collect()
+        };
+        Self {
+            grid: *grid,
+            crs: self.crs.clone(),
+            values,
+        }
+    }
+
+    /// The value between the four cell centres around a place; NaN beyond them or where one is
+    /// unknown and counts.
+    fn bilinear(&self, x: f64, y: f64) -> f64 {
+        let column = (x - self.grid.west) / self.grid.cell_x - 0.5;
+        let row = (self.grid.north - y) / self.grid.cell_y - 0.5;
+        let (c0, r0) = (column.floor(), row.floor());
+        let mut sum = 0.0;
+        for (c, r) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
+            let weight = (1.0 - (column - c0 - c).abs()) * (1.0 - (row - r0 - r).abs());
+            if weight == 0.0 {
+                continue;
+            }
+            let (c, r) = (c0 + c, r0 + r);
+            let inside =
+                c >= 0.0 && r >= 0.0 && c < self.grid.width as f64 && r < self.grid.height as f64;
+            if !inside {
+                return f64::NAN;
+            }
+            sum += weight * f64::from(self.at(c as usize, r as usize));
+        }
+        sum
+    }
+}
+
 /// Elevation over the cells of a grid that holds all `voxels`, each weighted by its points.
 ///
 /// The grid is aligned to multiples of `cell` metres. A few points far away (a wrong match near
@@ -290,6 +351,46 @@ mod tests {
         assert_eq!(max.count, [5.0, 7.0, 0.0, 2.0]);
         assert!((max.spread[0] - 6.64f32.sqrt()).abs() < 1e-6 && max.spread[2].is_nan());
         assert_eq!((max.spread[1], max.spread[3]), (0.0, 1.0));
+    }
+
+    #[test]
+    fn a_plane_stays_a_plane_on_other_grids() {
+        let grid = |cell: f64, n: usize| Grid {
+            width: n,
+            height: n,
+            west: -1.0,
+            north: 2.0,
+            cell_x: cell,
+            cell_y: cell,
+        };
+        let plane = |g: Grid| Raster {
+            grid: g,
+            crs: None,
+            values: (0..g.width * g.height)
+                .map(|i| g.centre(i % g.width, i / g.width))
+                .map(|(x, y)| (0.5 * x - 0.25 * y + 3.0) as f32)
+                .collect(),
+        };
+        let fine = plane(grid(0.125, 40));
+        let (coarse, finer) = (grid(0.5, 10), grid(0.05, 100));
+        for wanted in [coarse, finer] {
+            let there = fine.onto(&wanted);
+            let expected = plane(wanted);
+            let known = there.values.iter().filter(|v| v.is_finite()).count();
+            assert!(known as f64 > 0.9 * there.values.len() as f64, "{known}");
+            for (a, b) in there.values.iter().zip(&expected.values) {
+                assert!(a.is_nan() || (a - b).abs() < 1e-5, "{a} {b}");
+            }
+        }
+        // Unknown stays unknown, and so does what lies beyond.
+        let mut holed = fine.clone();
+        holed.values[..4 * 40].fill(f32::NAN);
+        assert!(holed.onto(&coarse).values[..10].iter().all(|v| v.is_nan()));
+        let away = Grid {
+            west: 100.0,
+            ..coarse
+        };
+        assert!(fine.onto(&away).values.iter().all(|v| v.is_nan()));
     }
 
     #[test]

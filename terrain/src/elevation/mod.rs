@@ -57,6 +57,19 @@ pub enum Gate {
     Cell,
 }
 
+/// What happens where a later scan contradicts a cell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Contradiction {
+    /// Both are believed less, by one factor, until they agree (the ratio of Birge 1932): the surer one
+    /// still decides the height, and the bounds tell of the quarrel.
+    #[default]
+    Widen,
+    /// The cell stays and gains a little variance (`multi_height_noise`), as elevation_mapping has it:
+    /// whoever came first is right.
+    Keep,
+}
+
 /// How measurements become an elevation map.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -67,7 +80,7 @@ pub struct ElevationConfig {
     pub hits: Hits,
     /// Smallest variance of a height, square metres. Default 9e-6, (3 mm)^2.
     pub min_variance: f64,
-    /// Largest variance of a measurement that is fused, square metres. Default 0.25, (0.5 m)^2.
+    /// Largest variance of a measurement that is fused, square metres. Default 0.01, (0.1 m)^2.
     pub max_variance: f64,
     /// Smallest deviation of a cell's place, metres. Default half a cell.
     pub min_horizontal: Option<f64>,
@@ -75,14 +88,22 @@ pub struct ElevationConfig {
     pub gate: Gate,
     /// How many deviations still fit. Default 2.5.
     pub gate_threshold: f64,
-    /// Variance that a cell gains when it is contradicted by a later scan, square metres. Default 9e-7.
+    /// Fewest points of a scan that make a measurement of a cell, with `per-scan`. Default 5.
+    pub min_points: u32,
+    /// Fewest of a cell's four neighbours that the same scan must measure too, with `per-scan`. Default
+    /// 4: at the rim of what a scan sees, where the near hides the far, matching hangs points into
+    /// the air, and how the ground goes on is not known.
+    pub min_neighbours: usize,
+    /// What happens where a later scan contradicts a cell. Default `widen`.
+    pub contradiction: Contradiction,
+    /// Variance that a cell gains when it is contradicted and kept, square metres. Default 9e-7.
     pub multi_height_noise: f64,
     /// Share of the old height kept where a higher point of the same scan wins. Default 0.
     pub increase_height_alpha: f64,
     /// Measurements no further apart in time are of one scan, seconds. Default 0.
     pub scanning_duration: f64,
-    /// Whether slopes count: heights vary within a cell by `g d / sqrt(12)`, and an error sideways is
-    /// one of height by the slope `g`. Default true; the papers leave it out.
+    /// Whether slopes count: heights vary within a cell by `g d / sqrt(12)` or more, and an error
+    /// sideways is one of height by the slope `g`. Default true; the papers leave it out.
     pub slopes: bool,
     /// Most cells. Default 10 million, 0.8 GB.
     pub max_cells: usize,
@@ -94,10 +115,13 @@ impl Default for ElevationConfig {
             cell: 0.05,
             hits: Hits::default(),
             min_variance: 9e-6,
-            max_variance: 0.25,
+            max_variance: 0.01,
             min_horizontal: None,
             gate: Gate::default(),
             gate_threshold: 2.5,
+            min_points: 5,
+            min_neighbours: 4,
+            contradiction: Contradiction::default(),
             multi_height_noise: 9e-7,
             increase_height_alpha: 0.0,
             scanning_duration: 0.0,
@@ -239,6 +263,8 @@ struct Bin {
     position: Vector3<f64>,
     /// Of heights in the map frame.
     height: f64,
+    /// Of squared heights above the sensor, which keeps digits.
+    height2: f64,
     /// Of squared deviations along the line of sight.
     sigma2: f64,
     linear_rgb: [f32; 3],
@@ -249,20 +275,22 @@ impl Bin {
         points: 0,
         position: Vector3::new(0.0, 0.0, 0.0),
         height: 0.0,
+        height2: 0.0,
         sigma2: 0.0,
         linear_rgb: [0.0; 3],
     };
 
     fn of(point: &CloudPoint, height: f64) -> Self {
         let mut bin = Self::EMPTY;
-        bin.add(point, height);
+        bin.add(point, height, 0.0);
         bin
     }
 
-    fn add(&mut self, point: &CloudPoint, height: f64) {
+    fn add(&mut self, point: &CloudPoint, height: f64, sensor: f64) {
         self.points += 1;
         self.position += point.position.coords;
         self.height += height;
+        self.height2 += (height - sensor).powi(2);
         self.sigma2 += f64::from(point.sigma * point.sigma);
         for (sum, c) in self.linear_rgb.iter_mut().zip(point.colour) {
             *sum += srgb_to_linear(c) as f32;
@@ -424,7 +452,9 @@ impl ElevationMap {
                 self.bin_of[slot] = bins.len() as u32;
                 bins.push((place, Bin::EMPTY));
             }
-            bins[self.bin_of[slot] as usize].1.add(point, p.z);
+            bins[self.bin_of[slot] as usize]
+                .1
+                .add(point, p.z, scan.T_map_sensor.translation.z);
         }
         let slopes: Vec<[f64; 2]> = bins.iter().map(|b| self.slope(b.0, &bins)).collect();
 
@@ -434,8 +464,10 @@ impl ElevationMap {
         match self.config.hits {
             Hits::PerScan => {
                 for ((place, bin), slope) in bins.iter().zip(&slopes) {
-                    let measurement = measure(scan, &self.config, bin, slope);
-                    self.fuse(*place, &measurement, scan.time);
+                    if self.is_well_seen(*place, &bins) {
+                        let measurement = measure(scan, &self.config, bin, slope);
+                        self.fuse(*place, &measurement, scan.time);
+                    }
                 }
             }
             Hits::PerPoint => {
@@ -463,6 +495,18 @@ impl ElevationMap {
         let place = (i.abs() < 1e15 && j.abs() < 1e15 && p.z.is_finite())
             .then_some([i as i64, j as i64])?;
         Some((place, self.window.slot(place)?))
+    }
+
+    /// Whether a scan has enough points in a cell and in its neighbours.
+    fn is_well_seen(&self, [i, j]: [i64; 2], bins: &[([i64; 2], Bin)]) -> bool {
+        let enough = |place: [i64; 2]| {
+            let bin = self.window.slot(place).map(|slot| self.bin_of[slot]);
+            bin.and_then(|bin| bins.get(bin as usize))
+                .is_some_and(|(_, bin)| bin.points >= self.config.min_points)
+        };
+        let neighbours = [[i - 1, j], [i + 1, j], [i, j - 1], [i, j + 1]];
+        enough([i, j])
+            && neighbours.into_iter().filter(|n| enough(*n)).count() >= self.config.min_neighbours
     }
 
     /// How the ground rises east and north at a bin, by the mean heights of its neighbours in the same
@@ -522,25 +566,34 @@ impl ElevationMap {
             };
             let deviations = (m.height - cell.height).abs() / innovation.sqrt();
             let same_scan = time - cell.time <= config.scanning_duration;
+            let mut doubt = 1.0;
             if deviations > config.gate_threshold {
-                if !same_scan {
-                    cell.random += config.multi_height_noise;
-                } else if m.height > cell.height {
-                    let keep = config.increase_height_alpha;
-                    cell.height = keep * cell.height + (1.0 - keep) * m.height;
-                    cell.random = keep * cell.random + (1.0 - keep) * m.random.max(floor);
-                    cell.systematic = keep * cell.systematic + (1.0 - keep) * m.systematic;
+                match config.contradiction {
+                    Contradiction::Widen => doubt = (deviations / config.gate_threshold).powi(2),
+                    Contradiction::Keep => {
+                        if !same_scan {
+                            cell.random += config.multi_height_noise;
+                        } else if m.height > cell.height {
+                            let keep = config.increase_height_alpha;
+                            let mix = |old: f64, new: f64| keep * old + (1.0 - keep) * new;
+                            cell.height = mix(cell.height, m.height);
+                            cell.random = mix(cell.random, m.random.max(floor));
+                            cell.systematic = mix(cell.systematic, m.systematic);
+                        }
+                        return;
+                    }
                 }
-                return;
             }
             let gain = cell.variance() / (cell.variance() + variance);
             // Two perfect measurements: neither knows better.
             let gain = if gain.is_nan() { 0.5 } else { gain };
             cell.height += gain * (m.height - cell.height);
             let random = (1.0 - gain).powi(2) * cell.random + gain * gain * m.random;
-            cell.random = random.max(floor);
             let systematic = (1.0 - gain) * cell.systematic.sqrt() + gain * m.systematic.sqrt();
             cell.systematic = systematic * systematic;
+            // A quarrel is no calibration's: what it adds may be settled by more looks.
+            let quarrel = (doubt - 1.0) * (random + cell.systematic);
+            cell.random = random.max(floor) + quarrel;
             cell.count = cell.count.saturating_add(m.points);
             let share = m.points as f32 / cell.count as f32;
             for (mean, c) in cell.linear_rgb.iter_mut().zip(m.linear_rgb) {
@@ -693,9 +746,15 @@ fn measure(scan: &Scan, config: &ElevationConfig, bin: &Bin, slope: &[f64; 2]) -
         let j = normal * pose_jacobian(&(rotation * mean.position.coords));
         systematic += (j * pose * j.transpose())[0];
     }
-    let rise = slope[0].hypot(slope[1]);
-    random += (rise * config.cell).powi(2) / 12.0;
     let n = f64::from(bin.points);
+    if config.slopes {
+        // How heights vary within the cell: by its slope, or by what the scan saw if that is more (a
+        // stone, an edge, points hung into the air).
+        let rise = slope[0].hypot(slope[1]);
+        let above_sensor = bin.height / n - scan.T_map_sensor.translation.z;
+        let spread = bin.height2 / n - above_sensor * above_sensor;
+        random += spread.max((rise * config.cell).powi(2) / 12.0);
+    }
     Measurement {
         height: bin.height / n,
         random,

@@ -31,6 +31,7 @@ fn plain(cell: f64) -> ElevationConfig {
         min_variance: 0.0,
         slopes: false,
         gate_threshold: 1e9,
+        contradiction: Contradiction::Keep,
         ..ElevationConfig::default()
     }
 }
@@ -449,6 +450,24 @@ fn the_gate_acts_as_it_is_written() {
         ..gated
     };
     assert_eq!(fuse(cell, &three).height, 0.0);
+    // Widening: the surer one decides, and the bounds reach to both. 0.5 m are 35 deviations.
+    let widen = ElevationConfig {
+        contradiction: Contradiction::Widen,
+        ..gated
+    };
+    let quarrel = fuse(widen, &[(0.0, 0.0), (0.5, 1.0)]);
+    assert!((quarrel.height - 0.25).abs() < 1e-12);
+    assert!((quarrel.variance() - (0.5f64 / 2.5).powi(2) / 4.0).abs() < 1e-12);
+    assert!(3.0 * quarrel.variance().sqrt() > 0.25);
+    // Many more that agree settle it.
+    let many: Vec<(f64, f64)> = (0..40)
+        .map(|i| (if i == 0 { 0.0 } else { 0.5 }, f64::from(i)))
+        .collect();
+    let settled = fuse(widen, &many);
+    assert!(
+        (settled.height - 0.5).abs() < 0.02 && settled.variance().sqrt() < 0.01,
+        "{settled:?}"
+    );
     // Measurements worse than the map accepts are not taken.
     let strict = ElevationConfig {
         max_variance: 1e-5,
@@ -468,6 +487,7 @@ fn errors_that_neighbours_share_do_not_make_the_bounds_too_narrow() {
             let mut map = ElevationMap::square(
                 ElevationConfig {
                     hits,
+                    min_neighbours: 0,
                     ..ElevationConfig::default()
                 },
                 1.0,
