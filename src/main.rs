@@ -75,7 +75,7 @@ fn main() -> ExitCode {
         Command::Map(args) => commands::map::run(args, &output),
         Command::Raster(args) => commands::raster::run(args, &output),
         Command::Report(args) => commands::report::run(args, &output),
-        Command::Eval(args) => commands::eval::run(args, &output),
+        Command::Eval(args) => commands::eval::run(args, &output, runtime),
         Command::Data(args) => match commands::data::run(args, &output) {
             // A check that found something is no error, and scripts want to know.
             Ok(false) => return ExitCode::from(1),

@@ -174,6 +174,33 @@ pub fn row_errors(frame: &StereoFrame, report: &Report) -> RgbImage {
     picture
 }
 
+/// A pair side by side, darkened, and a line for each match: its place in the left and in the right
+/// image, and its colour.
+pub fn matches_over_pair(
+    frame: &StereoFrame,
+    matches: &[([[f64; 2]; 2], image::Rgb<u8>)],
+) -> RgbImage {
+    let (width, height) = frame.left.dimensions();
+    let mut picture = RgbImage::new(2 * width, height);
+    replace(&mut picture, &bytes(&frame.left), 0, 0);
+    replace(&mut picture, &bytes(&frame.right), width.into(), 0);
+    picture
+        .pixels_mut()
+        .for_each(|p| p.0 = p.0.map(|v| v / 3 * 2));
+    let half = (width / 640).max(1) as i32;
+    for ([[u, v], [u_right, v_right]], colour) in matches {
+        let (du, dv) = (u_right + f64::from(width) - u, v_right - v);
+        let steps = du.abs().max(dv.abs()).ceil().max(1.0);
+        for k in 0..=steps as u32 {
+            let share = f64::from(k) / steps;
+            dot(&mut picture, u + share * du, v + share * dv, 0, *colour);
+        }
+        dot(&mut picture, *u, *v, half, *colour);
+        dot(&mut picture, u + du, v + dv, half, *colour);
+    }
+    picture
+}
+
 fn dot(image: &mut RgbImage, x: f64, y: f64, half: i32, colour: image::Rgb<u8>) {
     let (cx, cy) = (x.round() as i32, y.round() as i32);
     for y in cy - half..=cy + half {

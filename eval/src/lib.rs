@@ -1,8 +1,8 @@
 //! Scores: how far an estimate lies from the truth, by the definitions the field uses.
 //!
 //! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
-//! [`disparity`] (end-point error, bad pixels, density) and [`elevation`] (differences of heights,
-//! whether stated bounds hold).
+//! [`disparity`] (end-point error, bad pixels, density), [`matches`] (how many each rule accepts,
+//! how many are true) and [`elevation`] (differences of heights, whether stated bounds hold).
 //!
 //! What it promises: scores serialise to the JSON keys of the command line; a score is made of at
 //! least one comparison, so no figure is a division by zero; input that cannot be compared gives an
@@ -13,9 +13,11 @@
 pub mod disparity;
 pub mod elevation;
 mod error;
+pub mod matches;
 pub mod trajectory;
 
 pub use disparity::{DisparityFigures, DisparityScore, DisparityTally};
 pub use elevation::{BoundsScore, ComparedCell, ElevationScore};
 pub use error::EvalError;
+pub use matches::{MatchFigures, MatchScore, MatchTally};
 pub use trajectory::{SegmentScore, Similarity, TrajectoryScore};

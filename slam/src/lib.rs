@@ -23,6 +23,7 @@ mod patch;
 mod places;
 mod pose;
 mod pose_graph;
+mod rules;
 mod slam;
 mod tracker;
 mod vocabulary;
@@ -36,6 +37,7 @@ pub use matching::{DisparityGate, MatchCounts, hamming};
 pub use patch::Patch;
 pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
 pub use pose_graph::{PoseEdge, PoseGraph};
+pub use rules::{MatchRules, RuledMatch};
 pub use slam::{FrameReport, Slam, SlamResult};
 pub use vocabulary::{BagOfWords, Vocabulary, VocabularyError};
 

@@ -128,7 +128,7 @@ fn by_row(keypoints: &[Keypoint], height: usize) -> Vec<Vec<usize>> {
 
 /// The nearest feature, its distance, and that of the nearest one elsewhere: the same corner at a
 /// neighbouring scale, within 3 pixels, is no rival.
-fn two_nearest(
+pub(crate) fn two_nearest(
     descriptor: &Descriptor,
     candidates: impl Iterator<Item = usize>,
     features: &Features,

@@ -1,3 +1,5 @@
+mod matches;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -15,8 +17,9 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan eval trajectory --est runs/s/trajectory.tum --gt images/gt.csv\n  \
-    barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif
-    barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json")]
+    barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif\n  \
+     barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json\n  \
+     barchan eval matches --data images/ --model rover --out runs/m")]
 pub struct Args {
     #[command(subcommand)]
     what: What,
@@ -59,9 +62,10 @@ enum What {
         #[arg(long, value_name = "FILE")]
         error_map: Option<PathBuf>,
     },
+    Matches(matches::Args),
 }
 
-pub fn run(args: Args, output: &Output) -> Result<()> {
+pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     match args.what {
         What::Disparity { pred, gt } => disparity(&pred, &gt, output),
         What::Dem {
@@ -70,6 +74,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
             error_map,
         } => dem(&est, &reference, error_map.as_deref(), output),
         What::Trajectory { est, gt, tolerance } => trajectory(&est, &gt, tolerance, output),
+        What::Matches(args) => matches::run(args, output, runtime),
     }
 }
 

@@ -46,6 +46,23 @@ pub enum FeatureKind {
     Orb,
 }
 
+impl FeatureKind {
+    /// The detector; without a count AKAZE gives all that it finds.
+    pub fn detector(self, threshold: Option<f32>, most: Option<usize>) -> Box<dyn FeatureDetector> {
+        let config = SlamConfig::default();
+        match self {
+            Self::Akaze => Box::new(Akaze {
+                threshold: threshold.unwrap_or(1e-3),
+                most: most.unwrap_or(usize::MAX),
+            }),
+            Self::Orb => Box::new(Orb::new(
+                most.unwrap_or(config.features),
+                threshold.unwrap_or(config.corner_threshold),
+            )),
+        }
+    }
+}
+
 impl From<FeatureKind> for Detector {
     fn from(kind: FeatureKind) -> Self {
         match kind {
@@ -65,20 +82,7 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let detector: Box<dyn FeatureDetector> = match args.features {
-        FeatureKind::Akaze => Box::new(Akaze {
-            threshold: args.threshold.unwrap_or(1e-3),
-            most: args.keypoints.unwrap_or(usize::MAX),
-        }),
-        FeatureKind::Orb => {
-            let config = SlamConfig::default();
-            let threshold = args.threshold.unwrap_or(config.corner_threshold);
-            Box::new(Orb::new(
-                args.keypoints.unwrap_or(config.features),
-                threshold,
-            ))
-        }
-    };
+    let detector = args.features.detector(args.threshold, args.keypoints);
     let out = StagedDir::new(&args.out, "summary.json")?;
     let bar = output.progress("features", args.images.len());
     let (mut milliseconds, mut keypoints, mut bits) = (vec![], 0, 0);
