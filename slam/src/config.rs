@@ -72,7 +72,7 @@ impl Default for SlamConfig {
             detector: Detector::Orb,
             features: 900,
             corner_threshold: 5.0,
-            akaze_threshold: 1e-4,
+            akaze_threshold: 1e-5,
             nndr: 0.75,
             max_hamming_share: 0.25,
             row_tolerance: 1.5,

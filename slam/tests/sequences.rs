@@ -6,7 +6,7 @@ use std::path::Path;
 
 use barchan_datasets::{StereoFrame, StereoSource, open};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
-use barchan_slam::{FrameReport, LoopEvent, Slam, SlamConfig, SlamError, SlamResult};
+use barchan_slam::{Detector, FrameReport, LoopEvent, Slam, SlamConfig, SlamError, SlamResult};
 use block_matcher::BlockMatcher;
 
 fn slam(source: &dyn StereoSource) -> Slam {
@@ -135,6 +135,34 @@ fn a_rendered_traverse() {
     assert!(mean <= 0.6, "{mean} %");
 }
 
+/// SLAM by AKAZE.
+fn by_akaze(source: &dyn StereoSource) -> Slam {
+    let config = SlamConfig {
+        detector: Detector::Akaze,
+        ..SlamConfig::default()
+    };
+    Slam::new(*source.rig(), config, None)
+}
+
+#[test]
+fn a_real_rover_by_akaze() {
+    let Some(source) = arena() else { return };
+    let (reports, result) = track(by_akaze(source.as_ref()), frames(source.as_ref()));
+    assert_eq!(tracked(&reports), 128);
+    assert!(result.restarts.is_empty());
+    let score = score_of(&result, source.as_ref());
+    assert!(score.ate_rmse_sim3 <= 0.05, "{score:?}");
+}
+
+#[test]
+fn a_rendered_traverse_by_akaze() {
+    let source = open("synth:seed=3,frames=30").unwrap();
+    let (reports, result) = track(by_akaze(source.as_ref()), frames(source.as_ref()));
+    assert_eq!(tracked(&reports), 30);
+    let score = score_of(&result, source.as_ref());
+    assert!(score.ate_rmse <= 0.001 * score.length, "{score:?}");
+}
+
 #[test]
 fn a_round_is_closed_and_the_drift_goes() {
     let spec = "synth:seed=2,round=16,speed=1,frames=100,width=256,height=192";
@@ -172,12 +200,14 @@ fn nothing_is_seen_again_on_a_straight_line() {
 #[test]
 fn the_same_images_give_the_same_bits() {
     let source = open("synth:seed=2,frames=8,width=256,height=192").unwrap();
-    let run = || track(slam(source.as_ref()), frames(source.as_ref())).1;
-    let (a, b) = (run(), run());
-    assert_eq!(a.trajectory, b.trajectory);
-    let positions =
-        |r: &SlamResult| -> Vec<_> { r.map.points.values().map(|p| p.position).collect() };
-    assert_eq!(positions(&a), positions(&b));
+    for slam in [slam, by_akaze] {
+        let run = || track(slam(source.as_ref()), frames(source.as_ref())).1;
+        let (a, b) = (run(), run());
+        assert_eq!(a.trajectory, b.trajectory);
+        let positions =
+            |r: &SlamResult| -> Vec<_> { r.map.points.values().map(|p| p.position).collect() };
+        assert_eq!(positions(&a), positions(&b));
+    }
 }
 
 #[test]

@@ -192,3 +192,36 @@ impl Bits {
         bytes
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn turns_are_those_of_the_arc_tangent() {
+        for k in 0..1000 {
+            let angle = (k as f32 + 0.5) / 1000.0 * TAU;
+            let (y, x) = angle.sin_cos();
+            assert!(
+                (turn(3.0 * x, 3.0 * y) * TAU - angle).abs() < 3e-5,
+                "{angle}"
+            );
+        }
+        assert_eq!(turn(0.0, 0.0), 0.0);
+    }
+
+    #[test]
+    fn bits_follow_each_other_over_words() {
+        let mut bits = Bits::default();
+        let runs = [(0b1u64, 1), (0x7fff, 15), (0, 45), (0b10101, 5), (0b111, 3)];
+        for (word, count) in runs {
+            bits.push(word, count);
+        }
+        let bytes = bits.bytes();
+        let set: Vec<usize> = (0..512)
+            .filter(|i| bytes[i / 8] >> (i % 8) & 1 == 1)
+            .collect();
+        let expected: Vec<usize> = (0..16).chain([61, 63, 65, 66, 67, 68]).collect();
+        assert_eq!(set, expected);
+    }
+}

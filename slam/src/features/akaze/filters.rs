@@ -142,19 +142,13 @@ fn determinant_row(dxx: &[f32], dxy: &[f32], dyy: &[f32], out: &mut [f32]) {
 fn rows_around(image: &Plane, y: usize, spacing: usize) -> [&[f32]; 3] {
     let last = image.height() as usize - 1;
     let above = y.abs_diff(spacing).min(last);
-    let below = last.abs_diff(last.abs_diff(y + spacing)).min(last);
-    [
-        row(image, above),
-        row(image, y),
-        row(
-            image,
-            if y + spacing <= last {
-                y + spacing
-            } else {
-                below
-            },
-        ),
-    ]
+    let below = last.saturating_sub(last.abs_diff(y + spacing));
+    let below = if y + spacing <= last {
+        y + spacing
+    } else {
+        below
+    };
+    [above, y, below].map(|y| row(image, y))
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
@@ -277,5 +271,66 @@ fn diffuse_row(
             (c + c_above[x]) * (above[x] - value) + (c + c_below[x]) * (below[x] - value);
         let side = (c + c_here[inner]) * (here[inner] - value);
         out[x] = value + half_tau * (vertical + side);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plane(width: u32, height: u32, f: impl Fn(f32, f32) -> f32) -> Plane {
+        Plane::from_fn(width, height, |x, y| image::Luma([f(x as f32, y as f32)]))
+    }
+
+    #[test]
+    fn derivatives_of_a_quadric_are_exact_inside() {
+        // f = a x^2 + b x y + c y^2: by differences over 2 s pixels, which are exact for quadrics.
+        let (a, b, c) = (0.03, -0.02, 0.01);
+        let image = plane(60, 50, |x, y| a * x * x + b * x * y + c * y * y);
+        for spacing in [1, 2, 4] {
+            let s = spacing as f32;
+            let derivatives = gradient(&image, spacing);
+            let determinant = hessian_determinant(&derivatives, spacing);
+            let at = |plane: &Plane| plane.get_pixel(30, 20).0[0];
+            let (dx, dy) = (2.0 * a * 30.0 + b * 20.0, b * 30.0 + 2.0 * c * 20.0);
+            assert!((at(&derivatives[0]) - s * dx).abs() < 1e-4 * s);
+            assert!((at(&derivatives[1]) - s * dy).abs() < 1e-4 * s);
+            let exact = (4.0 * a * c - b * b) * s.powi(4);
+            assert!((at(&determinant) - exact).abs() < 1e-2 * exact);
+        }
+    }
+
+    #[test]
+    fn diffusion_keeps_the_mean_and_smooths() {
+        let image = plane(37, 23, |x, y| ((7.0 * x + 13.0 * y) % 11.0) / 11.0);
+        let conducts = plane(37, 23, |x, y| 0.5 + 0.4 * (x * y).sin());
+        let mut diffused = Plane::new(37, 23);
+        diffuse(&image, &conducts, 0.25, &mut diffused);
+        let moments = |p: &Plane| {
+            let n = p.len() as f64;
+            let mean = p.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
+            let variance = p
+                .iter()
+                .map(|v| (f64::from(*v) - mean).powi(2))
+                .sum::<f64>()
+                / n;
+            (mean, variance)
+        };
+        let (before, after) = (moments(&image), moments(&diffused));
+        assert!((before.0 - after.0).abs() < 1e-6, "{before:?} {after:?}");
+        assert!(after.1 < 0.9 * before.1, "{before:?} {after:?}");
+    }
+
+    #[test]
+    fn borders_mirror_however_small_the_image() {
+        for (width, height) in [(1, 1), (2, 3), (3, 1)] {
+            let flat = plane(width, height, |_, _| 0.5);
+            let [dx, dy] = gradient(&flat, 4);
+            assert!(dx.iter().chain(dy.iter()).all(|v| v.abs() < 1e-6));
+            assert!(blur::<9>(&flat, 1.6).iter().all(|v| (v - 0.5).abs() < 1e-6));
+            let mut diffused = Plane::new(width, height);
+            diffuse(&flat, &flat, 0.2, &mut diffused);
+            assert_eq!(diffused, flat);
+        }
     }
 }

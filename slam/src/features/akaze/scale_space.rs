@@ -97,7 +97,11 @@ fn fast_explicit_steps(time: f32) -> Vec<f32> {
         scale / angle.cos().powi(2)
     };
     // Multiples of about half of n, modulo a prime over n, visit every step once.
-    let is_prime = |p: &usize| (2..*p).take_while(|d| d * d <= *p).all(|d| p % d != 0);
+    let is_prime = |p: &usize| {
+        (2..*p)
+            .take_while(|d| d * d <= *p)
+            .all(|d| !p.is_multiple_of(d))
+    };
     let prime = (n + 1..).find(is_prime).unwrap_or(n + 1);
     let stride = (n / 2).max(1);
     (1..prime)
@@ -137,4 +141,41 @@ fn contrast_factor(smooth: &Plane) -> f32 {
         below += count;
     }
     largest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fast_explicit_steps_last_as_long_as_they_should() {
+        for time in [0.1, 0.53, 1.0, 7.3, 58.0] {
+            let steps = fast_explicit_steps(time);
+            let sum: f32 = steps.iter().sum();
+            assert!((sum - time).abs() < 1e-3 * time, "{time}: {sum}");
+            // Fewer than stable explicit steps would be.
+            assert!(steps.len() as f32 <= (time / 0.25).ceil().max(1.0));
+            assert!(steps.iter().all(|s| *s > 0.0));
+        }
+    }
+
+    #[test]
+    fn diffusion_stops_at_edges_and_goes_on_between_them() {
+        // A step edge, and ripples too weak to be edges.
+        let image = Plane::from_fn(120, 90, |x, y| {
+            let step = if x < 60 { 0.2 } else { 0.8 };
+            image::Luma([step + 0.01 * ((x + y) as f32).sin()])
+        });
+        let levels = scale_space(&image);
+        let at = |level: &Level, x| level.image.get_pixel(x, 45).0[0];
+        let (first, last) = (&levels[0], &levels[3]);
+        let across = |level| at(level, 63) - at(level, 56);
+        assert!(across(last) > 0.97 * across(first), "{}", across(last));
+        let ripple = |level| {
+            let values: Vec<f32> = (20..40).map(|x| at(level, x)).collect();
+            let largest = values.iter().copied().fold(f32::MIN, f32::max);
+            largest - values.iter().copied().fold(f32::MAX, f32::min)
+        };
+        assert!(ripple(last) < 0.6 * ripple(first), "{}", ripple(last));
+    }
 }
