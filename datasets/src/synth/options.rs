@@ -20,6 +20,7 @@ sun=AZ:EL         degrees: where the sun stands, from x towards y, and above the
 sky=hazy          hazy, clear or black
 route=circle      circle, loop (crosses itself), survey (lanes, stops, full turns) or straight
 round=56          metres of a round of the circle, from 15; more than 56 only on a dem that has room
+beside=0          metres that a round of the circle lies outside of the one before
 speed=0.4         metres a second; a frame is taken every 0.2 s
 stops=0           metres between stops of 6 s (survey: 6, with a full turn of the mast in 24 s)
 pan=0             degrees, where the mast looks, to the left of ahead positive (survey: -90)
@@ -86,6 +87,8 @@ pub(super) struct Options {
     pub route: RouteKind,
     /// Metres of a round of the circle.
     pub round: Option<f64>,
+    /// Metres that each round lies outside of the one before.
+    pub beside: f64,
     pub speed: f64,
     pub stops: Option<f64>,
     /// Radians.
@@ -132,6 +135,7 @@ impl Default for Options {
             sky: None,
             route: RouteKind::Circle,
             round: None,
+            beside: 0.0,
             speed: 0.4,
             stops: None,
             pan: None,
@@ -266,6 +270,7 @@ impl Options {
                 ])?;
             }
             "round" => self.round = Some(read.within(15.0, 2000.0, "metres")?),
+            "beside" => self.beside = read.within(0.0, 1.0, "metres")?,
             "speed" => self.speed = read.within(0.01, 2.0, "metres a second")?,
             "stops" => self.stops = Some(read.within(0.0, 1000.0, "metres")?),
             "pan" => self.pan = Some(read.within(-360.0f64, 360.0, "degrees")?.to_radians()),
@@ -287,7 +292,7 @@ impl Options {
 }
 
 const COMMON: [&str; 6] = ["seed", "frames", "width", "height", "baseline", "noise"];
-const ROVER: [&str; 25] = [
+const ROVER: [&str; 26] = [
     "look",
     "texture",
     "dem",
@@ -299,6 +304,7 @@ const ROVER: [&str; 25] = [
     "sky",
     "route",
     "round",
+    "beside",
     "speed",
     "stops",
     "pan",

@@ -25,6 +25,8 @@ pub(super) struct Plan {
     pub centre: Vector2<f64>,
     /// Size of the route, times the usual.
     pub scale: f64,
+    /// Metres that each round of the circle lies outside of the one before.
+    beside: f64,
     /// Where on the circle it starts, or where the straight line leads, radians.
     start: f64,
     speed: f64,
@@ -54,6 +56,7 @@ impl Plan {
             kind: options.route,
             centre: Vector2::zeros(),
             scale: options.round.map_or(1.0, |round| round / Self::ROUND),
+            beside: options.beside,
             start: share * TAU,
             speed: options.speed,
             between_stops: options.stops.unwrap_or(if survey { 6.0 } else { 0.0 }),
@@ -71,7 +74,8 @@ impl Plan {
         let at = match self.kind {
             RouteKind::Circle => {
                 let angle = self.start + s / Self::RADIUS;
-                let radius = Self::RADIUS + 0.8 * (3.0 * angle + self.start).sin();
+                let beside = self.beside / self.scale * (angle - self.start) / TAU;
+                let radius = Self::RADIUS + 0.8 * (3.0 * angle + self.start).sin() + beside;
                 Vector2::new(angle.cos(), angle.sin()) * radius
             }
             RouteKind::Loop => {
@@ -265,6 +269,11 @@ mod tests {
             let plan = plan(&format!("round={round},seed=3"));
             assert!((plan.place(round) - plan.place(0.0)).norm() < 1e-9);
             assert!((plan.place(round / 2.0) - plan.place(0.0)).norm() > 0.25 * round);
+            let wider = Plan {
+                beside: 0.3,
+                ..plan
+            };
+            assert!(((wider.place(round) - wider.place(0.0)).norm() - 0.3).abs() < 1e-9);
         }
     }
 
