@@ -88,6 +88,13 @@ $(PEERS_TORCH)/ready: $(TORCH_PINS)
 	$(PEERS_TORCH)/bin/python scripts/torch_cpu.py
 	touch $@
 
+SITES = synth:seed=11,frames=150 synth:seed=12,frames=150,look=moon \
+	synth:seed=13,frames=150,look=arena synth:seed=14,frames=150,look=devon
+vocabularies: build ## the visual words that slam ships, from renders (2 minutes)
+	$(BARCHAN) vocabulary $(SITES:%=--data %,width=484,height=366) --out slam/src/vocabulary-orb.txt
+	$(BARCHAN) vocabulary $(SITES:%=--data %,width=484,height=366) --features akaze --depth 3 \
+		--out slam/src/vocabulary-akaze.txt
+
 onnxruntime: ## ONNX Runtime's library into the cache, where barchan looks for it
 	@$(PYTHON) scripts/onnxruntime.py
 

@@ -13,6 +13,16 @@ pub enum Detector {
     Akaze,
 }
 
+impl Detector {
+    /// Bytes of a descriptor that it fills.
+    pub fn descriptor_bytes(self) -> usize {
+        match self {
+            Self::Orb => Orb::BYTES,
+            Self::Akaze => Akaze::BYTES,
+        }
+    }
+}
+
 /// Everything that decides how SLAM runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -27,8 +37,10 @@ pub struct SlamConfig {
     pub akaze_threshold: f32,
     /// Nearest-neighbour distance ratio below which a stereo match is accepted on looks alone.
     pub nndr: f64,
-    /// Most differing bits of two descriptors that match, as a share of all.
+    /// Most differing bits of two ORB descriptors that match, as a share of all.
     pub max_hamming_share: f64,
+    /// The same of AKAZE, whose bits come again more surely.
+    pub akaze_max_hamming_share: f64,
     /// Largest row difference of a stereo match, pixels, at the finest scale.
     pub row_tolerance: f64,
     /// Smallest disparity of a point that is mapped, pixels; smaller ones say too little of depth.
@@ -75,6 +87,7 @@ impl Default for SlamConfig {
             akaze_threshold: 1e-5,
             nndr: 0.75,
             max_hamming_share: 0.25,
+            akaze_max_hamming_share: 0.2,
             row_tolerance: 1.5,
             min_disparity: 1.5,
             disparity_sigma: 2.0,
@@ -109,6 +122,10 @@ impl SlamConfig {
 
     /// Most differing bits of two descriptors of `bits` bits that match.
     pub(crate) fn max_hamming(&self, bits: u32) -> u32 {
-        (self.max_hamming_share * f64::from(bits)) as u32
+        let share = match self.detector {
+            Detector::Orb => self.max_hamming_share,
+            Detector::Akaze => self.akaze_max_hamming_share,
+        };
+        (share * f64::from(bits)) as u32
     }
 }

@@ -11,7 +11,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::features::{Descriptor, octave_scale};
+use crate::features::Descriptor;
 use crate::map::{Map, PointId};
 use crate::matching::{Grid, match_all, match_projections};
 use crate::places::{Island, Places};
@@ -249,7 +249,7 @@ impl LoopCloser {
         (event, Some(found))
     }
 
-    /// A point seen by a feature of a key frame: to a pixel of the feature's level, whatever its
+    /// A point seen by a feature of a key frame: to a pixel of the feature's scale, whatever its
     /// alignment, for the point is not better known than that from where it is looked at now.
     fn observation(
         &self,
@@ -260,7 +260,7 @@ impl LoopCloser {
     ) -> Observation {
         let k = map.keyframes[keyframe].features.keypoints[feature];
         let at = Keypoint {
-            sigma: octave_scale(k.octave),
+            sigma: k.scale,
             ..k
         };
         let d = self.disparities[keyframe][feature];
@@ -288,8 +288,8 @@ impl LoopCloser {
                 let at = Keypoint {
                     u: at.u,
                     v: at.v,
-                    octave: point.octave,
-                    sigma: octave_scale(point.octave),
+                    scale: point.scale,
+                    sigma: point.scale,
                 };
                 ids.push(*id);
                 expected.push((point.descriptor, at));
@@ -453,7 +453,7 @@ mod tests {
         let at = Keypoint {
             u: 0.0,
             v: 0.0,
-            octave: 0,
+            scale: 1.0,
             sigma: 1.0,
         };
         let keyframe = |frame: usize| Keyframe {
@@ -464,6 +464,7 @@ mod tests {
             features: Features {
                 keypoints: vec![at; 3],
                 descriptors: vec![[0; _]; 3],
+                bits: 256,
             },
             disparities: vec![None; 3],
             points: vec![None; 3],

@@ -98,8 +98,9 @@ impl Slam {
     ) -> Self {
         Self {
             detector: config.feature_detector(),
-            loops: (config.loops.enabled)
-                .then(|| LoopCloser::new(rig, config.clone(), Vocabulary::orb())),
+            loops: config.loops.enabled.then(|| {
+                LoopCloser::new(rig, config.clone(), Vocabulary::shipped(config.detector))
+            }),
             tracker: Tracker::new(rig, config.clone()),
             rig,
             config,

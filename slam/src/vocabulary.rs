@@ -10,11 +10,13 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
+use crate::config::Detector;
 use crate::features::Descriptor;
 use crate::hamming;
 
-/// The vocabulary that is shipped: ORB features of rendered traverses, made by `barchan vocabulary`.
-const SHIPPED: &str = include_str!("vocabulary-orb.txt");
+/// The shipped vocabularies: features of rendered traverses, made by `make vocabularies`.
+const SHIPPED_ORB: &str = include_str!("vocabulary-orb.txt");
+const SHIPPED_AKAZE: &str = include_str!("vocabulary-akaze.txt");
 
 /// A tree of descriptors whose leaves are words.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,11 +61,16 @@ impl BagOfWords {
 }
 
 impl Vocabulary {
-    /// The vocabulary for ORB features that is shipped.
-    pub fn orb() -> Arc<Self> {
-        static PARSED: OnceLock<Arc<Vocabulary>> = OnceLock::new();
-        let parse = || Arc::new(SHIPPED.parse().unwrap_or_else(|_| Self::of_nothing()));
-        PARSED.get_or_init(parse).clone()
+    /// The vocabulary for the features of a detector that is shipped.
+    pub fn shipped(detector: Detector) -> Arc<Self> {
+        static ORB: OnceLock<Arc<Vocabulary>> = OnceLock::new();
+        static AKAZE: OnceLock<Arc<Vocabulary>> = OnceLock::new();
+        let (parsed, text) = match detector {
+            Detector::Orb => (&ORB, SHIPPED_ORB),
+            Detector::Akaze => (&AKAZE, SHIPPED_AKAZE),
+        };
+        let parse = || Arc::new(text.parse().unwrap_or_else(|_| Self::of_nothing()));
+        parsed.get_or_init(parse).clone()
     }
 
     /// A root without words: every image is an empty bag, like no other.
@@ -498,16 +505,18 @@ mod tests {
     }
 
     #[test]
-    fn the_shipped_one_is_whole() {
-        let shipped: Vocabulary = SHIPPED.parse().unwrap();
-        assert!(shipped.len() > 5000, "{}", shipped.len());
-        assert!(SHIPPED.len() <= 1_500_000);
-        assert!(
-            shipped
-                .nodes
-                .iter()
-                .all(|n| n.children.len() <= shipped.branching)
-        );
+    fn the_shipped_ones_are_whole() {
+        for (detector, text, words) in [
+            (Detector::Orb, SHIPPED_ORB, 5000),
+            (Detector::Akaze, SHIPPED_AKAZE, 500),
+        ] {
+            let shipped: Vocabulary = text.parse().unwrap();
+            assert!(shipped.len() > words, "{}", shipped.len());
+            assert!(text.len() <= 1_500_000);
+            assert_eq!(shipped.bytes(), detector.descriptor_bytes());
+            let mut nodes = shipped.nodes.iter();
+            assert!(nodes.all(|n| n.children.len() <= shipped.branching));
+        }
     }
 
     #[test]

@@ -63,7 +63,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     if args.data.is_none() {
         let estimate = inside("slam/trajectory.tum");
         let command = ["eval", "trajectory", "--est", &estimate, "--gt", &truth];
-        eval::run(typed(output, &command)?, output)?;
+        eval::run(typed(output, &command)?, output, runtime)?;
     }
     let page = inside("report.html");
     let mut command = vec!["report", &slam_run, "--map", &map_dir, "--out", &page];

@@ -18,8 +18,8 @@ use crate::output::Output;
 #[command(after_help = "Examples:\n  \
     barchan eval trajectory --est runs/s/trajectory.tum --gt images/gt.csv\n  \
     barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif\n  \
-     barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json\n  \
-     barchan eval matches --data images/ --model rover --out runs/m")]
+    barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json\n  \
+    barchan eval matches --data images/ --model rover --out runs/m")]
 pub struct Args {
     #[command(subcommand)]
     what: What,

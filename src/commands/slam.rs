@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
 use barchan_geometry::{Rig, Trajectory};
 use barchan_infer::DisparityMap;
-use barchan_slam::{LoopEvent, MatchCounts, Orb, Slam, SlamConfig, SlamResult, Vocabulary};
+use barchan_slam::{Detector, LoopEvent, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary};
 use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
@@ -87,7 +87,9 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             args.data
         );
     }
-    let words = args.vocabulary.as_deref().map(vocabulary).transpose()?;
+    let words = (args.vocabulary.as_deref())
+        .map(|path| vocabulary(path, config.detector))
+        .transpose()?;
     let engine = load_engine(&args.model, runtime, args.threads)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     out.write("config.toml", toml::to_string(&config)?)?;
@@ -201,15 +203,15 @@ fn configuration(args: &Args) -> Result<SlamConfig> {
     Ok(config)
 }
 
-fn vocabulary(path: &Path) -> Result<Vocabulary> {
+fn vocabulary(path: &Path, detector: Detector) -> Result<Vocabulary> {
     let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let words: Vocabulary = text.parse().with_context(|| path.display().to_string())?;
-    if words.bytes() != Orb::BYTES {
+    let bytes = detector.descriptor_bytes();
+    if words.bytes() != bytes {
         bail!(
-            "{}: its words are {} bytes long, but descriptors of ORB features {}\n  cure: make one with `barchan vocabulary`",
+            "{}: its words are {} bytes long, but descriptors of the features {bytes}\n  cure: make one with `barchan vocabulary --features`",
             path.display(),
-            words.bytes(),
-            Orb::BYTES
+            words.bytes()
         );
     }
     Ok(words)

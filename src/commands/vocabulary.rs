@@ -2,10 +2,11 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{luma, open, write_whole};
-use barchan_slam::{Descriptor, Orb, SlamConfig, SlamError, Vocabulary};
+use barchan_slam::{Descriptor, SlamConfig, SlamError, Vocabulary};
 use clap::Parser;
 use serde::Serialize;
 
+use crate::commands::features::FeatureKind;
 use crate::output::Output;
 
 /// Learn the visual words by which `barchan slam` recognises places
@@ -20,6 +21,9 @@ pub struct Args {
     /// The file that is written, as DBoW2 writes and reads it
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Whose features are learnt from; `barchan slam --features` must be given the same
+    #[arg(long, value_enum, default_value = "orb")]
+    features: FeatureKind,
     /// Children of a node of the tree
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u8).range(2..=20))]
     branching: u8,
@@ -42,15 +46,18 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let config = SlamConfig::default();
-    let orb = Orb::new(config.features, config.corner_threshold);
+    let config = SlamConfig {
+        detector: args.features.into(),
+        ..SlamConfig::default()
+    };
+    let detector = config.feature_detector();
     let mut images: Vec<Vec<Descriptor>> = Vec::new();
     for data in &args.data {
         let source = open(data)?;
         let bar = output.progress(data, source.len());
         for i in (0..source.len()).step_by(args.every.max(1)) {
             let frame = source.frame(i)?;
-            let features = orb.extract(&luma(&frame.left));
+            let features = detector.detect(&luma(&frame.left));
             let features = features.map_err(|message| SlamError::Features {
                 frame: frame.name.clone(),
                 message,
@@ -61,7 +68,8 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         bar.finish_and_clear();
     }
     let (branching, depth) = (usize::from(args.branching), usize::from(args.depth));
-    let vocabulary = Vocabulary::train(&images, branching, depth, Orb::BYTES, args.seed);
+    let bytes = config.detector.descriptor_bytes();
+    let vocabulary = Vocabulary::train(&images, branching, depth, bytes, args.seed);
     if vocabulary.is_empty() {
         bail!("no features in {:?}: are the images blank?", args.data);
     }

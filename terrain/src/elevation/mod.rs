@@ -544,8 +544,8 @@ impl ElevationMap {
         }
         let cell = &mut self.cells[slot];
         let upper = (m.height + 3.0 * variance.sqrt()) as f32;
-        // Not written with <, so that the first of all counts.
-        if !(cell.lowest <= upper) {
+        // NaN stands for none yet.
+        if cell.lowest.is_nan() || upper < cell.lowest {
             cell.lowest = upper;
             cell.seen_from = self.sensors.len() as u32 - 1;
         }

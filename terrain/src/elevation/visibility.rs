@@ -23,7 +23,7 @@ impl ElevationMap {
             let rise = f64::from(end.lowest) - sensor.z;
             // One step a cell along the longer axis; the last cell is the one that was seen.
             let steps = (dx.abs().max(dy.abs()) / cell).ceil();
-            if !(steps >= 1.0 && steps < 1e6) {
+            if !(1.0..1e6).contains(&steps) {
                 continue;
             }
             for k in 0..steps as usize {

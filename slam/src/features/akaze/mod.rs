@@ -25,6 +25,11 @@ pub struct Akaze {
     pub most: usize,
 }
 
+impl Akaze {
+    /// Bytes of a descriptor that are in use: 486 bits.
+    pub const BYTES: usize = 61;
+}
+
 impl FeatureDetector for Akaze {
     fn detect(&self, grey: &Plane) -> Result<Features, String> {
         // The finest descriptor is 60 pixels wide.
@@ -127,7 +132,15 @@ mod tests {
         let before = ALL.detect(&blobs(width, height, 0.0, 1.0, 0.5)).unwrap();
         assert!(before.keypoints.len() > 40, "{}", before.keypoints.len());
         let middle = Vector2::new(f64::from(width), f64::from(height)) / 2.0;
-        for (turn, zoom) in [(0.0, 1.0), (0.7, 1.0), (2.5, 1.0), (0.0, 1.3), (-1.2, 0.8)] {
+        // With how many of them OpenCV 4.14's AKAZE, on the same images, finds again by looks alone:
+        // blobs are round, and so have hardly a direction to be described along.
+        for (turn, zoom, known) in [
+            (0.0, 1.0, 53),
+            (0.7, 1.0, 39),
+            (2.5, 1.0, 40),
+            (0.0, 1.3, 29),
+            (-1.2, 0.8, 28),
+        ] {
             let after = ALL.detect(&blobs(width, height, turn, zoom, 0.35)).unwrap();
             let (mut in_view, mut again, mut alike) = (0, 0, 0);
             for (k, look) in before.keypoints.iter().zip(&before.descriptors) {
@@ -155,8 +168,8 @@ mod tests {
                 "{turn} {zoom}: {again} of {in_view} come again"
             );
             assert!(
-                alike * 10 >= in_view * 6,
-                "{turn} {zoom}: {alike} of {in_view} look alike"
+                alike * 5 >= known * 4,
+                "{turn} {zoom}: {alike} of {in_view} look alike, {known} to OpenCV"
             );
         }
     }
