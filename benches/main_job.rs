@@ -7,7 +7,8 @@ use barchan_geometry::{Se3, se3};
 use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Rejection, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
 use barchan_slam::{BundleAdjustment, Observation, PoseEdge, PoseGraph, Slam, SlamConfig};
-use barchan_terrain::{Cloud, DepthLimits, VoxelMap};
+use barchan_terrain::elevation::{ElevationConfig, ElevationMap, Scan, SensorModel};
+use barchan_terrain::{Cloud, DepthLimits, StereoErrors, VoxelMap};
 use divan::Bencher;
 
 /// Frames of Hong's rover: 484 x 366 pixels.
@@ -116,8 +117,12 @@ fn pose_graph_5000_poses_5500_edges(bencher: Bencher) {
         });
 }
 
-#[divan::bench(sample_count = 20)]
-fn voxels_of_one_frame(bencher: Bencher) {
+/// The cloud of one frame, 177 thousand pixels of true disparity, in the camera's frame.
+fn cloud() -> (
+    Cloud,
+    barchan_geometry::StampedPose,
+    barchan_geometry::RectifiedRig,
+) {
     let source = open("synth:seed=5,frames=1,width=484,height=366").expect("a valid specification");
     let frame = source.frame(0).expect("rendering reads no file");
     let truth = source
@@ -125,14 +130,16 @@ fn voxels_of_one_frame(bencher: Bencher) {
         .ok()
         .flatten()
         .expect("renders have truth");
-    let cloud = Cloud::from_disparity(
-        source.rig(),
-        &frame.left,
-        &truth,
-        None,
-        &DepthLimits::default(),
-    )
-    .expect("sizes agree");
+    let limits = DepthLimits::default();
+    let cloud = Cloud::from_disparity(source.rig(), &frame.left, &truth, None, &limits)
+        .expect("sizes agree");
+    let pose = source.true_trajectory().expect("renders have truth").poses[0];
+    (cloud, pose, *source.rig())
+}
+
+#[divan::bench(sample_count = 20)]
+fn voxels_of_one_frame(bencher: Bencher) {
+    let (cloud, _, _) = cloud();
     bencher.bench_local(|| {
         let mut map = VoxelMap::new(0.02).expect("above zero");
         map.insert(&cloud);
@@ -185,4 +192,25 @@ fn bundle_adjustment(bencher: Bencher) {
     bencher
         .with_inputs(|| problem.clone())
         .bench_local_values(|mut problem| problem.solve(&rig, 10));
+}
+
+#[divan::bench(sample_count = 20)]
+fn elevation_of_one_frame(bencher: Bencher) {
+    let (cloud, pose, rig) = cloud();
+    let mut map = ElevationMap::new(ElevationConfig::default()).expect("defaults are valid");
+    let errors = StereoErrors::default();
+    let scan = Scan {
+        cloud: &cloud,
+        T_map_sensor: pose.T_world_cam,
+        pose_covariance: None,
+        sensor: SensorModel::Stereo {
+            focal: rig.fx,
+            baseline: rig.baseline,
+            pixel: errors.pixel,
+            systematic: errors.systematic,
+            shared: errors.shared,
+        },
+        time: pose.time,
+    };
+    bencher.bench_local(|| map.add_growing(&scan).is_ok());
 }

@@ -2,7 +2,8 @@
 //!
 //! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
 //! [`disparity`] (end-point error, bad pixels, density), [`matches`] (how many each rule accepts,
-//! how many are true) and [`elevation`] (differences of heights, whether stated bounds hold).
+//! how many are true), [`elevation`] (differences of heights, whether stated bounds hold) and
+//! [`cloud`] (registration and distances).
 //!
 //! What it promises: scores serialise to the JSON keys of the command line; a score is made of at
 //! least one comparison, so no figure is a division by zero; input that cannot be compared gives an
@@ -10,9 +11,11 @@
 //!
 //! What it never does: read a file, run an engine, or repair an estimate before judging it.
 
+pub mod cloud;
 pub mod disparity;
 pub mod elevation;
 mod error;
+mod kd_tree;
 pub mod matches;
 pub mod trajectory;
 

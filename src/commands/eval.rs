@@ -4,12 +4,17 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, open, read_planar};
+use barchan_eval::cloud::{
+    CloudScore, IcpConfig, IcpMethod, Reference, Registration, register, score as score_cloud,
+};
 use barchan_eval::disparity::DisparityTally;
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
 use barchan_eval::{ComparedCell, elevation};
-use barchan_geometry::Trajectory;
-use barchan_terrain::Raster;
+use barchan_geometry::nalgebra::Point3;
+use barchan_geometry::{Se3, Trajectory};
+use barchan_terrain::{Cloud, Raster};
 use clap::{Parser, Subcommand};
+use serde::Serialize;
 
 use crate::output::Output;
 
@@ -17,6 +22,7 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan eval trajectory --est runs/s/trajectory.tum --gt images/gt.csv\n  \
+    barchan eval cloud --est map/cloud.ply --ref survey.laz\n  \
     barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif\n  \
     barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json\n  \
     barchan eval matches --data images/ --model rover --out runs/m")]
@@ -48,6 +54,21 @@ enum What {
         #[arg(long, default_value_t = DEFAULT_TOLERANCE)]
         tolerance: f64,
     },
+    /// A cloud against a true one: distances as it lies, then after registration, and the motion of that
+    Cloud {
+        /// The estimate: .ply, .las or .laz
+        #[arg(long, value_name = "FILE")]
+        est: PathBuf,
+        /// The truth: a cloud, or the cell centres of a GeoTIFF
+        #[arg(long = "ref", value_name = "FILE")]
+        reference: PathBuf,
+        /// Points farther than this from the truth lie outside of it, metres
+        #[arg(long, default_value_t = IcpConfig::default().max_distance, value_name = "M")]
+        max_distance: f64,
+        /// Matches planes with planes (generalised ICP) instead of points with planes
+        #[arg(long)]
+        generalised: bool,
+    },
     /// Elevations against true ones in the same frame, cell by cell; of `elevation.tif` also whether
     /// its bounds hold
     Dem {
@@ -68,6 +89,22 @@ enum What {
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     match args.what {
         What::Disparity { pred, gt } => disparity(&pred, &gt, output),
+        What::Cloud {
+            est,
+            reference,
+            max_distance,
+            generalised,
+        } => {
+            let config = IcpConfig {
+                max_distance,
+                method: match generalised {
+                    true => IcpMethod::Generalised,
+                    false => IcpMethod::PointToPlane,
+                },
+                ..IcpConfig::default()
+            };
+            cloud(&est, &reference, &config, output)
+        }
         What::Dem {
             est,
             reference,
@@ -118,6 +155,86 @@ fn disparity(pred: &Path, gt: &str, output: &Output) -> Result<()> {
         text += &line("estimated", estimated);
     }
     output.result(&score, &text)
+}
+
+#[derive(Serialize)]
+struct CloudFigures {
+    as_it_lies: CloudScore,
+    registration: Registration,
+    /// Rows of the 4 x 4 matrix that maps the estimate to the reference.
+    transform: [[f64; 4]; 4],
+    registered: CloudScore,
+}
+
+/// Points that registration uses at most: more change nothing but the time.
+const REGISTERED_POINTS: usize = 100_000;
+
+fn cloud(est: &Path, reference: &Path, config: &IcpConfig, output: &Output) -> Result<()> {
+    let context = || format!("{} against {}", est.display(), reference.display());
+    let estimate = read_points(est)?;
+    let truth = Reference::new(&read_points(reference)?)
+        .with_context(|| reference.display().to_string())?;
+    let as_it_lies = score_cloud(&estimate, &truth, config.max_distance).with_context(context)?;
+    let step = estimate.len().div_ceil(REGISTERED_POINTS).max(1);
+    let sample: Vec<_> = estimate.iter().copied().step_by(step).collect();
+    let registration = register(&sample, &truth, &Se3::identity(), config).with_context(context)?;
+    let moved: Vec<_> = estimate
+        .iter()
+        .map(|p| registration.T_ref_est * p)
+        .collect();
+    let registered = score_cloud(&moved, &truth, config.max_distance).with_context(context)?;
+    let matrix = registration.T_ref_est.to_homogeneous();
+    let transform = std::array::from_fn(|r| std::array::from_fn(|c| matrix[(r, c)]));
+
+    let mut text = format!(
+        "{:<16} {:>8} {:>8} {:>8} {:>8} {:>8} {:>9}\n",
+        "", "rmse m", "p50 m", "p68 m", "p95 m", "<0.5 m %", "overlap %"
+    );
+    for (title, s) in [("as it lies", &as_it_lies), ("registered", &registered)] {
+        text += &format!(
+            "{title:<16} {:>8.4} {:>8.4} {:>8.4} {:>8.4} {:>8.2} {:>9.2}\n",
+            s.rmse,
+            s.p50,
+            s.p68,
+            s.p95,
+            100.0 * s.within_half_metre,
+            100.0 * s.overlap
+        );
+    }
+    text += &format!(
+        "registration moved it by {:.4} m and {:.4} deg in {} iterations{}",
+        registration.translation,
+        registration.rotation_deg,
+        registration.iterations,
+        if registration.converged {
+            ""
+        } else {
+            " and did not come to rest"
+        }
+    );
+    let figures = CloudFigures {
+        as_it_lies,
+        registration,
+        transform,
+        registered,
+    };
+    output.result(&figures, &text)
+}
+
+/// The points of a cloud, or the centres of the known cells of a raster.
+fn read_points(path: &Path) -> Result<Vec<Point3<f64>>> {
+    let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+    if extension != "tif" && extension != "tiff" {
+        let points = Cloud::read(path)?.points;
+        return Ok(points.into_iter().map(|p| p.position).collect());
+    }
+    let dem = Raster::<f32>::read(path)?;
+    let known = dem.values.iter().enumerate().filter(|(_, z)| z.is_finite());
+    let centre = |(i, z): (usize, &f32)| {
+        let (x, y) = dem.grid.centre(i % dem.grid.width, i / dem.grid.width);
+        Point3::new(x, y, f64::from(*z))
+    };
+    Ok(known.map(centre).collect())
 }
 
 fn dem(est: &Path, reference: &Path, error_map: Option<&Path>, output: &Output) -> Result<()> {

@@ -54,6 +54,9 @@ pub struct Args {
     /// best: TUM text, KITTI text, gt.csv, or gnss.csv (the antenna is taken for the camera)
     #[arg(long, value_name = "FILE", conflicts_with = "poses")]
     align: Option<PathBuf>,
+    /// Writes cloud.pcd as well
+    #[arg(long)]
+    pcd: bool,
     /// Removes what later key frames see through
     #[arg(long)]
     clear_ghosts: bool,
@@ -183,7 +186,12 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     let elevation_cells = widths().count();
     let band_width = widths().sum::<f64>() / elevation_cells.max(1) as f64;
 
-    map.cloud().write_ply(&out.path("cloud.ply")?)?;
+    let cloud = map.cloud();
+    cloud.write_ply(&out.path("cloud.ply")?)?;
+    cloud.write_las(&out.path("cloud.laz")?)?;
+    if args.pcd {
+        cloud.write_pcd(&out.path("cloud.pcd")?)?;
+    }
     map.dem.write(&out.path("dem.tif")?)?;
     elevation.write(&out.path("elevation.tif")?, args.bounds.into())?;
     map.hillshade.write(&out.path("hillshade.tif")?)?;
@@ -212,7 +220,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     out.finish()?;
     let text = format!(
         "{} key frames, {} points in {} voxels of {} m; DEM {} x {} cells of {} m ({:.1} x {:.1} m)\n\
-         {} cells of known elevation, bounds {:.3} m wide on average\n{}: cloud.ply dem.tif hillshade.tif elevation.tif keyframes.tum",
+         {} cells of known elevation, bounds {:.3} m wide on average\n{}: cloud.ply cloud.laz dem.tif hillshade.tif elevation.tif keyframes.tum",
         summary.keyframes,
         summary.points,
         summary.voxels,

@@ -1,4 +1,6 @@
-use barchan_datasets::{Plane, Rgb};
+use std::path::Path;
+
+use barchan_datasets::{Plane, Rgb, luma};
 use barchan_geometry::{RectifiedRig, Se3, StereoPoint};
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
@@ -44,6 +46,10 @@ pub struct DepthLimits {
     /// but an estimate smeared over an occluding edge ("flying pixels"). Flat ground seen from a
     /// height `h` stays at `baseline / h` or below.
     pub max_step: f64,
+    /// Smallest accepted standard deviation of brightness in the 9 x 9 pixels around, grey levels of
+    /// 255. Default 2, twice a camera's noise: in the sky and in burnt-out places any disparity
+    /// matches, and networks state one with confidence.
+    pub min_contrast: f64,
     /// Takes every n-th pixel of every n-th row. Default 1.
     pub stride: usize,
 }
@@ -57,6 +63,7 @@ impl Default for DepthLimits {
             default_sigma: 0.5,
             min_sigma: 0.25,
             max_step: 1.0,
+            min_contrast: 2.0,
             stride: 1,
         }
     }
@@ -98,6 +105,7 @@ impl Cloud {
             });
         }
 
+        let contrast = Contrast::new(left);
         let max_depth = limits.max_depth.unwrap_or(f64::INFINITY);
         let (w, d) = (rig.width, disparity.as_raw());
         let mut points = Vec::new();
@@ -106,6 +114,7 @@ impl Cloud {
                 let i = v * w + u;
                 if !d[i].is_finite()
                     || steepest_step(d, w, rig.height, u, v) > limits.max_step as f32
+                    || contrast.at(u, v) < limits.min_contrast
                 {
                     continue;
                 }
@@ -143,6 +152,22 @@ impl Cloud {
         Ok(Self { points })
     }
 
+    /// Reads a PLY, LAS or LAZ file, as its name ends.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is damaged, or is of another format.
+    pub fn read(path: &Path) -> Result<Self, TerrainError> {
+        let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+        match extension.to_str() {
+            Some("ply") => Self::read_ply(path),
+            Some("las" | "laz") => Self::read_las(path),
+            _ => Err(TerrainError::Cloud {
+                path: path.to_owned(),
+                message: "its name ends in none of .ply, .las, .laz".into(),
+            }),
+        }
+    }
+
     /// The cloud in another frame: every position is mapped by `T_b_a`.
     #[allow(non_snake_case)]
     pub fn transform(mut self, T_b_a: &Se3) -> Self {
@@ -150,6 +175,59 @@ impl Cloud {
             p.position = T_b_a * p.position;
         }
         self
+    }
+}
+
+/// How much the brightness of an image varies around each pixel.
+struct Contrast {
+    width: usize,
+    height: usize,
+    /// Sums of brightness and of its square, grey levels, over all pixels above and left of a corner.
+    sums: Vec<[f64; 2]>,
+}
+
+impl Contrast {
+    /// Pixels to each side.
+    const HALF: usize = 4;
+
+    fn new(image: &Rgb) -> Self {
+        let brightness = luma(image);
+        let (width, height) = (image.width() as usize, image.height() as usize);
+        let mut sums = vec![[0.0; 2]; (width + 1) * (height + 1)];
+        for (y, row) in brightness.as_raw().chunks_exact(width.max(1)).enumerate() {
+            let mut along = [0.0; 2];
+            for (x, value) in row.iter().enumerate() {
+                let grey = f64::from(*value) * 255.0;
+                along = [along[0] + grey, along[1] + grey * grey];
+                let above = sums[y * (width + 1) + x + 1];
+                sums[(y + 1) * (width + 1) + x + 1] = [above[0] + along[0], above[1] + along[1]];
+            }
+        }
+        Self {
+            width,
+            height,
+            sums,
+        }
+    }
+
+    /// Standard deviation around a pixel, grey levels.
+    fn at(&self, x: usize, y: usize) -> f64 {
+        let (left, right) = (
+            x.saturating_sub(Self::HALF),
+            (x + Self::HALF + 1).min(self.width),
+        );
+        let (top, bottom) = (
+            y.saturating_sub(Self::HALF),
+            (y + Self::HALF + 1).min(self.height),
+        );
+        let corner = |x: usize, y: usize| self.sums[y * (self.width + 1) + x];
+        let n = ((right - left) * (bottom - top)) as f64;
+        let [mean, square] = [0, 1].map(|k| {
+            (corner(right, bottom)[k] - corner(left, bottom)[k] - corner(right, top)[k]
+                + corner(left, top)[k])
+                / n
+        });
+        (square - mean * mean).max(0.0).sqrt()
     }
 }
 
@@ -187,12 +265,14 @@ pub(crate) mod tests {
         }
     }
 
-    pub(crate) fn grey(rig: &RectifiedRig) -> Rgb {
-        Rgb::from_pixel(
-            rig.width as u32,
-            rig.height as u32,
-            image::Rgb([0.2, 0.4, 1.0]),
-        )
+    /// Of two colours, pixel by pixel.
+    pub(crate) fn chequered(rig: &RectifiedRig) -> Rgb {
+        Rgb::from_fn(rig.width as u32, rig.height as u32, |x, y| {
+            match (x + y) % 2 {
+                0 => image::Rgb([0.2, 0.4, 1.0]),
+                _ => image::Rgb([0.4, 0.6, 1.0]),
+            }
+        })
     }
 
     fn constant(rig: &RectifiedRig, value: f32) -> Plane {
@@ -208,9 +288,14 @@ pub(crate) mod tests {
         let disparity = Plane::from_fn(160, 120, |x, y| {
             image::Luma([10.0 + 0.02 * x as f32 + 0.1 * y as f32])
         });
-        let cloud =
-            Cloud::from_disparity(&rig, &grey(&rig), &disparity, None, &DepthLimits::default())
-                .unwrap();
+        let cloud = Cloud::from_disparity(
+            &rig,
+            &chequered(&rig),
+            &disparity,
+            None,
+            &DepthLimits::default(),
+        )
+        .unwrap();
         assert_eq!(cloud.points.len(), 160 * 120);
         for (i, p) in cloud.points.iter().enumerate() {
             let at = rig.project(&p.position).unwrap();
@@ -218,7 +303,15 @@ pub(crate) mod tests {
                 (at.u - (i % 160) as f64).abs() < 1e-9 && (at.v - (i / 160) as f64).abs() < 1e-9
             );
             assert!((at.d - f64::from(disparity.as_raw()[i])).abs() < 1e-9);
-            assert_eq!(p.colour, [51, 102, 255]);
+            let even = (i % 160 + i / 160) % 2 == 0;
+            assert_eq!(
+                p.colour,
+                if even {
+                    [51, 102, 255]
+                } else {
+                    [102, 153, 255]
+                }
+            );
             // The same first order as the full covariance of the geometry crate.
             let full = rig.point_covariance(&p.position, 0.0, 0.5)[(2, 2)].sqrt();
             assert!((f64::from(p.sigma) - full).abs() < 1e-6 * full);
@@ -233,7 +326,7 @@ pub(crate) mod tests {
             let sigma = sigma.map(|s| constant(&rig, s));
             Cloud::from_disparity(
                 &rig,
-                &grey(&rig),
+                &chequered(&rig),
                 &constant(&rig, d),
                 sigma.as_ref(),
                 limits,
@@ -288,14 +381,46 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn what_has_no_texture_makes_no_points() {
+        let rig = rig();
+        // Ground below, and a sky above in which only noise of a grey level differs.
+        let mut image = chequered(&rig);
+        for (x, y, pixel) in image.enumerate_pixels_mut().filter(|p| p.1 < 40) {
+            let noise = ((x * 7 + y * 13) % 5) as f32 - 2.0;
+            pixel.0 = [0.7 + 0.7 * noise / 255.0; 3];
+        }
+        let limits = DepthLimits::default();
+        let rows = |limits| {
+            let cloud =
+                Cloud::from_disparity(&rig, &image, &constant(&rig, 20.0), None, limits).unwrap();
+            assert_eq!(cloud.points.len() % 160, 0);
+            cloud.points.len() / 160
+        };
+        // The window reaches four pixels into the sky.
+        assert_eq!(rows(&limits), 84);
+        assert_eq!(
+            rows(&DepthLimits {
+                min_contrast: 0.0,
+                ..limits
+            }),
+            120
+        );
+    }
+
+    #[test]
     fn smeared_edges_are_dropped_and_clean_surfaces_kept() {
         let rig = rig();
         // Near box, far wall, and between them an estimate smeared over 6 pixels.
         let smeared = |x: u32| (30.0 - (f64::from(x) - 57.0).clamp(0.0, 6.0) / 6.0 * 20.0) as f32;
         let disparity = Plane::from_fn(160, 120, |x, _| image::Luma([smeared(x)]));
-        let cloud =
-            Cloud::from_disparity(&rig, &grey(&rig), &disparity, None, &DepthLimits::default())
-                .unwrap();
+        let cloud = Cloud::from_disparity(
+            &rig,
+            &chequered(&rig),
+            &disparity,
+            None,
+            &DepthLimits::default(),
+        )
+        .unwrap();
         // Both surfaces lie at 1/3 m and at 1 m; anything between is a flying pixel.
         assert!(
             cloud
@@ -330,8 +455,14 @@ pub(crate) mod tests {
     fn another_size_or_a_stride_of_zero_is_refused() {
         let rig = rig();
         let small = Plane::new(10, 10);
-        let error = Cloud::from_disparity(&rig, &grey(&rig), &small, None, &DepthLimits::default())
-            .unwrap_err();
+        let error = Cloud::from_disparity(
+            &rig,
+            &chequered(&rig),
+            &small,
+            None,
+            &DepthLimits::default(),
+        )
+        .unwrap_err();
         assert!(
             error.to_string().contains("disparity is (10, 10)"),
             "{error}"
@@ -341,7 +472,8 @@ pub(crate) mod tests {
             ..DepthLimits::default()
         };
         assert!(
-            Cloud::from_disparity(&rig, &grey(&rig), &constant(&rig, 9.0), None, &zero).is_err()
+            Cloud::from_disparity(&rig, &chequered(&rig), &constant(&rig, 9.0), None, &zero)
+                .is_err()
         );
     }
 }

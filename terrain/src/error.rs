@@ -19,6 +19,14 @@ pub enum TerrainError {
         /// What is wrong.
         message: String,
     },
+    /// A point cloud file of another format is not what it should be.
+    #[error("{path}: not a point cloud that can be read or written: {message}")]
+    Cloud {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        message: String,
+    },
     /// A raster file is not what it should be.
     #[error("{path}: {message}")]
     Raster {

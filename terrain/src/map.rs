@@ -228,6 +228,9 @@ pub struct StereoErrors {
     /// Deviation of the disparity's error that all looks at a place share, pixels. Default 0.1: a
     /// calibration, and a preference of matching for some fractions of a pixel.
     pub systematic: f64,
+    /// Share of the stated variance of disparity that all looks share. Default 1, all of it: what
+    /// matching gets wrong at a place it gets wrong from a metre on as well.
+    pub shared: f64,
 }
 
 impl Default for StereoErrors {
@@ -235,6 +238,7 @@ impl Default for StereoErrors {
         Self {
             pixel: 1.0,
             systematic: 0.1,
+            shared: 1.0,
         }
     }
 }
@@ -262,6 +266,7 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
         baseline: rig.baseline,
         pixel: errors.pixel,
         systematic: errors.systematic,
+        shared: errors.shared,
     };
     // How the levelled frame's axes lie to the world's, for shift and rotation alike.
     let rotation = T_level_world.rotation.to_rotation_matrix();
@@ -327,7 +332,7 @@ fn nothing(keyframes: usize, config: &MapConfig) -> TerrainError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::tests::{grey, rig};
+    use crate::cloud::tests::{chequered, rig};
     use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
     /// A camera `height` above z = 0 at (x, y), looking along +x, pitched down.
@@ -379,7 +384,7 @@ mod tests {
             time: 0.0,
             T_world_cam,
             pose_covariance: None,
-            left: grey(rig),
+            left: chequered(rig),
             disparity,
             sigma: None,
         })

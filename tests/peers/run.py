@@ -1,14 +1,16 @@
 """barchan's outputs against programs nobody here wrote. `make peers` runs this.
 
 Trains for a moment on a rendered traverse, exports, infers, tracks and maps, and holds every file
-against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile and a browser. Real images and published trajectories
-join where ../shared/data has them. Exits 1 when a figure is out of bounds or a check fails to run.
+against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile, laspy, pypcd4, small_gicp and a browser. Real
+images and published trajectories join where ../shared/data has them. Exits 1 when a figure is out of
+bounds or a check fails to run.
 """
 
 import argparse
 import shutil
 from pathlib import Path
 
+import clouds
 import features
 import files
 import matching
@@ -41,7 +43,7 @@ def main() -> None:
         barchan("export", run, "--out", model)
         barchan("infer", "--data", f"folder:{data}", "--model", model, "--out", work / "infer")
         barchan("slam", "--data", f"folder:{data}", "--model", model, "--out", work / "slam")
-        barchan("map", work / "slam", "--out", work / "map")
+        barchan("map", work / "slam", "--pcd", "--out", work / "map")
 
     def exported(table: Table) -> None:
         network.check_file(table, model)
@@ -74,6 +76,10 @@ def main() -> None:
         files.check_frame_clouds(table, work / "infer", data)
         files.check_cloud(table, work / "slam" / "map.ply")
         files.check_cloud(table, work / "map" / "cloud.ply")
+        clouds.check_files(table, work / "map")
+
+    def registration(table: Table) -> None:
+        clouds.check_registration(table, barchan, work)
 
     def browser(table: Table) -> None:
         page.check(table, barchan, work / "slam", work / "map", work)
@@ -81,7 +87,8 @@ def main() -> None:
     def timings(table: Table) -> None:
         speed.report(barchan, work)
 
-    Table().run([prepare, exported, engines, matchers, key_points, trajectories, terrain, formats, browser, timings])
+    checks = [exported, engines, matchers, key_points, trajectories, terrain, formats, registration, browser]
+    Table().run([prepare, *checks, timings])
 
 
 if __name__ == "__main__":

@@ -28,8 +28,11 @@ pub enum SensorModel {
         baseline: f64,
         /// Deviation of where in the image a point is seen, pixels: matching looks at windows.
         pixel: f64,
-        /// Deviation of the disparity's error that all looks share, pixels.
+        /// Deviation of the disparity's error that all looks share at least, pixels.
         systematic: f64,
+        /// Share of the variance of disparity that all looks share: what matching gets wrong at a place
+        /// it gets wrong again from a metre on.
+        shared: f64,
     },
     /// `normal = a + b (z - c)^2 + d z^e`, `lateral = l z`, metres.
     StructuredLight {
@@ -96,14 +99,17 @@ impl SensorModel {
                 baseline,
                 pixel,
                 systematic,
+                shared,
             } => {
                 // dp/dd = -p / d, so an error of disparity moves a point along its line of sight:
                 // by sigma_z / z = sigma_d / d of its distance.
                 let across = (pixel * z / focal).powi(2);
+                let sigma = f64::from(point.sigma) / z;
+                let floor = systematic * z / (focal * baseline);
                 PointCovariance {
-                    random: along_sight(f64::from(point.sigma) / z)
+                    random: along_sight(sigma * (1.0 - shared).max(0.0).sqrt())
                         + Matrix3::from_diagonal(&[across, across, 0.0].into()),
-                    systematic: along_sight(systematic * z / (focal * baseline)),
+                    systematic: along_sight(floor.max(sigma * shared.sqrt())),
                 }
             }
             Self::StructuredLight { a, b, c, d, e, l } => {
@@ -182,6 +188,7 @@ mod tests {
             baseline: 0.2,
             pixel: 0.7,
             systematic: 0.0,
+            shared: 0.0,
         };
         for (x, y, z) in [(0.0, 0.0, 2.0), (0.8, -0.3, 3.0), (-2.0, 1.0, 9.0)] {
             let sigma_z = 0.5 * z * z / 80.0;
@@ -198,6 +205,7 @@ mod tests {
             baseline: 0.2,
             pixel: 0.0,
             systematic: 0.5,
+            shared: 0.0,
         };
         for (z, metres) in [(1.0, 0.00625), (2.0, 0.025), (10.0, 0.625)] {
             let c = shared.covariance(&at(0.0, 0.0, z, 0.0));

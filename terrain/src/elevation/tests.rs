@@ -508,6 +508,7 @@ fn errors_that_neighbours_share_do_not_make_the_bounds_too_narrow() {
                         baseline: 0.1,
                         pixel: 0.0,
                         systematic,
+                        shared: 0.0,
                     },
                     f64::from(i),
                 ));
