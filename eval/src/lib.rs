@@ -1,7 +1,7 @@
 //! Scores: how far an estimate lies from the truth, by the definitions the field uses.
 //!
 //! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
-//! [`disparity`] (end-point error, bad pixels, density), [`matches`] (how many each rule accepts,
+//! [`disparity`] (end-point error, bad pixels, density), [`mod@matches`] (how many each rule accepts,
 //! how many are true), [`elevation`] (differences of heights, whether stated bounds hold) and
 //! [`cloud`] (registration and distances).
 //!

@@ -41,8 +41,7 @@ impl Cloud {
             let steps = (p.position - origin) / RESOLUTION;
             for (k, step) in steps.iter().enumerate() {
                 let step = step.round();
-                // Not written with >, so that NaN is refused too.
-                if !(step.abs() < f64::from(i32::MAX)) {
+                if step.is_nan() || step.abs() >= f64::from(i32::MAX) {
                     return Err(bad(format!(
                         "{} is too far from the first point",
                         p.position
