@@ -7,6 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 /// The Cholesky factor of a sparse symmetric matrix of 6 x 6 blocks. The pattern is analysed once:
 /// an order of elimination by least degree (George and Liu 1989), and the blocks that fill in. Then
 /// each matrix of that pattern is factored without looking for anything.
+#[derive(Clone)]
 pub(crate) struct BlockCholesky {
     /// Block column of each unknown in the order of elimination.
     position: Vec<usize>,
@@ -93,9 +94,9 @@ impl BlockCholesky {
         }
     }
 
-    /// Factors the matrix in place, column by column, and solves for one right side; `None` when the
-    /// matrix is not positive definite. The matrix is lost.
-    pub fn solve(&mut self, right: &[Vector6<f64>]) -> Option<Vec<Vector6<f64>>> {
+    /// Factors the matrix in place, column by column; `None` when it is not positive definite. The
+    /// matrix is lost.
+    fn factor(&mut self) -> Option<()> {
         for column in 0..self.rows.len() {
             let factor = self.diagonal[column].cholesky()?.unpack();
             self.diagonal[column] = factor;
@@ -116,7 +117,13 @@ impl BlockCholesky {
             }
             self.below[column] = blocks;
         }
+        Some(())
+    }
 
+    /// Factors the matrix and solves for one right side; `None` when the matrix is not positive
+    /// definite. The matrix is lost.
+    pub fn solve(&mut self, right: &[Vector6<f64>]) -> Option<Vec<Vector6<f64>>> {
+        self.factor()?;
         let mut x = vec![Vector6::zeros(); right.len()];
         for (k, value) in right.iter().enumerate() {
             x[self.position[k]] = *value;
@@ -137,6 +144,52 @@ impl BlockCholesky {
             x[column] = value;
         }
         Some(self.position.iter().map(|p| x[*p]).collect())
+    }
+
+    /// Factors the matrix and gives the diagonal blocks of its inverse; `None` when it is not positive
+    /// definite. From the last column to the first, those blocks of the inverse that lie where the
+    /// factor has blocks follow from each other (Takahashi, Fagan and Chen 1973); no other is needed.
+    pub fn inverse_diagonal(&mut self) -> Option<Vec<Matrix6<f64>>> {
+        self.factor()?;
+        let mut inverse = Self {
+            diagonal: vec![Matrix6::zeros(); self.rows.len()],
+            below: vec![Vec::new(); self.rows.len()],
+            position: self.position.clone(),
+            rows: self.rows.clone(),
+        };
+        for column in (0..self.rows.len()).rev() {
+            let mut root = Matrix6::identity();
+            self.diagonal[column].solve_lower_triangular_mut(&mut root);
+            let scaled: Vec<Matrix6<f64>> = self.below[column].iter().map(|b| b * root).collect();
+            let rows = &self.rows[column];
+            let below = rows.iter().map(|i| {
+                let products = rows.iter().zip(&scaled);
+                products.fold(Matrix6::zeros(), |sum, (k, u)| sum - inverse.at(*i, *k) * u)
+            });
+            let below: Vec<Matrix6<f64>> = below.collect();
+            let own = root.transpose() * root;
+            let products = scaled.iter().zip(&below);
+            inverse.diagonal[column] = products.fold(own, |sum, (u, z)| sum - u.transpose() * z);
+            inverse.below[column] = below;
+        }
+        Some(self.position.iter().map(|p| inverse.diagonal[*p]).collect())
+    }
+
+    /// The block at a row and column in the order of elimination; zero outside of the pattern.
+    fn at(&self, row: usize, column: usize) -> Matrix6<f64> {
+        if row == column {
+            return self.diagonal[row];
+        }
+        let (low, high) = (row.max(column), row.min(column));
+        let Ok(k) = self.rows[high].binary_search(&low) else {
+            return Matrix6::zeros();
+        };
+        let block = self.below[high][k];
+        if row > column {
+            block
+        } else {
+            block.transpose()
+        }
     }
 }
 
@@ -173,10 +226,16 @@ mod tests {
             .map(|_| Vector6::from_fn(|_, _| rng.random_range(-1.0..1.0)))
             .collect();
         let stacked = DVector::from_iterator(6 * n, right.iter().flatten().copied());
-        let expected = dense.cholesky().unwrap().solve(&stacked);
-        let found = sparse.solve(&right).unwrap();
+        let whole = dense.cholesky().unwrap();
+        let expected = whole.solve(&stacked);
+        let found = sparse.clone().solve(&right).unwrap();
         for (k, x) in found.iter().enumerate() {
             assert!((x - expected.fixed_rows::<6>(6 * k)).norm() < 1e-9, "{k}");
+        }
+        let whole = whole.inverse();
+        for (k, block) in sparse.inverse_diagonal().unwrap().iter().enumerate() {
+            let expected = whole.fixed_view::<6, 6>(6 * k, 6 * k);
+            assert!((block - expected).norm() < 1e-9, "{k}");
         }
     }
 

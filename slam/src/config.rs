@@ -49,6 +49,9 @@ pub struct SlamConfig {
     /// but a shift of all disparities, which calibration leaves, is no noise that averages out, and
     /// motion is better taken from where points go than from how their disparity changes.
     pub disparity_sigma: f64,
+    /// Standard deviation of the disparity of a match, pixels, from which follows how well the poses
+    /// are known; two successive key frames see a point with about the same error.
+    pub match_sigma: f64,
     /// Standard deviation of a sighting found by alignment with the point's first picture, in pixels
     /// of its scale.
     pub alignment_sigma: f64,
@@ -91,6 +94,7 @@ impl Default for SlamConfig {
             row_tolerance: 1.5,
             min_disparity: 1.5,
             disparity_sigma: 2.0,
+            match_sigma: 0.5,
             alignment_sigma: 0.5,
             gate: true,
             gate_px: 3.0,

@@ -26,6 +26,7 @@ mod pose_graph;
 mod rules;
 mod slam;
 mod tracker;
+mod uncertainty;
 mod vocabulary;
 
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};

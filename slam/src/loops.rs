@@ -1,7 +1,7 @@
 //! A place seen before: find it, prove it by geometry, and take the drift out of the map (Galvez-Lopez
 //! and Tardos 2012 for finding; Hong 2021, 3.2.3 for proving with dense disparity).
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use barchan_datasets::Plane;
@@ -25,7 +25,7 @@ const NEIGHBOUR_SIGMA: (f64, f64) = (0.005, 0.0005);
 /// Deviation of the motion that a loop measures.
 const LOOP_SIGMA: (f64, f64) = (0.01, 0.002);
 /// Deviation of the guess that leads over a gap in tracking.
-const GUESS_SIGMA: (f64, f64) = (10.0, 1.0);
+pub(crate) const GUESS_SIGMA: (f64, f64) = (10.0, 1.0);
 /// Key frames that share so many points are tied in the pose graph.
 const COVISIBLE: usize = 40;
 /// Key frames before and after a found one, whose points are looked for too.
@@ -130,17 +130,11 @@ impl LoopCloser {
     /// Takes note of the newest key frame of the map, of which `dense` is the disparity. Looks for
     /// places that look like it, that its predecessors found too, and that it does not see the same
     /// points as anyway. The first that geometry confirms is a loop: the pose graph is solved, key
-    /// frames and points move, and points that were mapped twice become one. `restarts` are the key
-    /// frames that hang on the one before by a guess only.
+    /// frames and points move, and points that were mapped twice become one.
     ///
     /// Gives each place that was tried.
     #[allow(non_snake_case)]
-    pub fn close(
-        &mut self,
-        map: &mut Map,
-        dense: Option<&Plane>,
-        restarts: &[usize],
-    ) -> Vec<LoopEvent> {
+    pub fn close(&mut self, map: &mut Map, dense: Option<&Plane>) -> Vec<LoopEvent> {
         let Some(newest) = map.keyframes.len().checked_sub(1) else {
             return Vec::new();
         };
@@ -157,7 +151,8 @@ impl LoopCloser {
             event.proved = found.is_some();
             if let Some(found) = found.filter(|_| loops.correct) {
                 let before = map.keyframes[newest].T_cam_world.inverse();
-                self.correct(map, newest, island.keyframe, &found, restarts);
+                self.correct(map, newest, island.keyframe, &found);
+                join(map, newest, island.keyframe);
                 self.fuse(map, newest, island.keyframe, &found);
                 let after = map.keyframes[newest].T_cam_world.inverse();
                 event.moved = (after.translation.vector - before.translation.vector).norm();
@@ -167,6 +162,17 @@ impl LoopCloser {
             events.push(event);
         }
         events
+    }
+
+    /// Motions that closed loops measured.
+    pub fn edges(&self) -> &[PoseEdge] {
+        &self.edges
+    }
+
+    /// Key frames that look most like these descriptors, the likeliest first: where a camera that is
+    /// lost may be.
+    pub fn likeliest(&self, descriptors: &[Descriptor]) -> Vec<usize> {
+        self.places.likeliest(descriptors)
     }
 
     /// Disparity of each feature of the newest key frame: dense where that is wanted and known,
@@ -303,14 +309,7 @@ impl LoopCloser {
 
     /// Solves the pose graph with the new loop in it, and moves key frames and points.
     #[allow(non_snake_case)]
-    fn correct(
-        &mut self,
-        map: &mut Map,
-        newest: usize,
-        earlier: usize,
-        found: &Found,
-        restarts: &[usize],
-    ) {
+    fn correct(&mut self, map: &mut Map, newest: usize, earlier: usize, found: &Found) {
         self.edges.push(PoseEdge {
             a: earlier,
             b: newest,
@@ -328,20 +327,22 @@ impl LoopCloser {
             sigma_rotation: rotation,
             robust: false,
         };
-        let guessed = |k: usize| restarts.contains(&k);
-        let mut edges: Vec<PoseEdge> = (1..=newest)
-            .map(|k| {
-                let sigma = if guessed(k) {
-                    GUESS_SIGMA
-                } else {
-                    NEIGHBOUR_SIGMA
-                };
-                tie(k - 1, k, sigma)
-            })
-            .collect();
-        let covisible = covisibility(map).into_iter();
-        let strong = covisible.filter(|((a, b), shared)| a + 1 < *b && *shared >= COVISIBLE);
-        edges.extend(strong.map(|((a, b), _)| tie(a, b, NEIGHBOUR_SIGMA)));
+        let mut edges = Vec::new();
+        for k in 1..=newest {
+            let shared = map
+                .shared_with(k)
+                .into_iter()
+                .filter(|(other, _)| *other < k);
+            // The first shares most.
+            for (place, (other, count)) in shared.enumerate() {
+                if place == 0 || other + 1 == k || count >= COVISIBLE {
+                    edges.push(tie(other, k, NEIGHBOUR_SIGMA));
+                }
+            }
+            if edges.last().is_none_or(|e| e.b != k) {
+                edges.push(tie(k - 1, k, GUESS_SIGMA));
+            }
+        }
         edges.extend(&self.edges);
         let mut graph = PoseGraph {
             T_world_cam: old.iter().map(Se3::inverse).collect(),
@@ -417,17 +418,14 @@ fn points_around(map: &Map, keyframe: usize) -> Vec<PointId> {
     ids.into_iter().collect()
 }
 
-/// How many points each two key frames share.
-fn covisibility(map: &Map) -> BTreeMap<(usize, usize), usize> {
-    let mut shared = BTreeMap::new();
-    for point in map.points.values() {
-        for (i, (a, _)) in point.observations.iter().enumerate() {
-            for (b, _) in &point.observations[i + 1..] {
-                *shared.entry((*a.min(b), *a.max(b))).or_default() += 1;
-            }
+/// Makes the parts of the map that two key frames belong to one.
+fn join(map: &mut Map, a: usize, b: usize) {
+    let (a, b) = (map.keyframes[a].submap, map.keyframes[b].submap);
+    for keyframe in &mut map.keyframes {
+        if keyframe.submap == a.max(b) {
+            keyframe.submap = a.min(b);
         }
     }
-    shared
 }
 
 /// Key frames that see a point of a key frame, and those that see a point of these.
@@ -460,6 +458,7 @@ mod tests {
             frame,
             name: String::new(),
             time: frame as f64,
+            submap: 0,
             T_cam_world: Se3::identity(),
             features: Features {
                 keypoints: vec![at; 3],
@@ -527,10 +526,8 @@ mod tests {
         }
         assert_eq!(connected(&map, 0), BTreeSet::from([0, 1, 2]));
         assert_eq!(connected(&map, 4), BTreeSet::from([4]));
-        let shared = covisibility(&map);
-        assert_eq!(
-            shared,
-            BTreeMap::from([((0, 1), 1), ((1, 2), 1), ((2, 3), 1)])
-        );
+        assert_eq!(map.shared_with(1), [(2, 1), (0, 1)]);
+        assert_eq!(map.around(0, 3), [0, 1, 2]);
+        assert_eq!(map.around(4, 3), [4]);
     }
 }

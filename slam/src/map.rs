@@ -1,5 +1,6 @@
 //! Key frames, the points they see, and who sees what.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use barchan_geometry::Se3;
@@ -21,6 +22,9 @@ pub struct Keyframe {
     pub name: String,
     /// Seconds.
     pub time: f64,
+    /// The part of the map it belongs to: how parts lie to each other is a guess, until a loop joins
+    /// them.
+    pub submap: usize,
     /// Maps world points to the left camera.
     pub T_cam_world: Se3,
     /// Features of the left image.
@@ -120,14 +124,45 @@ impl Map {
         }
     }
 
-    /// Points seen by any of the key frames from `first` on, in order.
-    pub fn points_since(&self, first: usize) -> Vec<PointId> {
-        let mut ids: Vec<PointId> = self.keyframes[first.min(self.keyframes.len())..]
+    /// Points seen by any of these key frames, in order.
+    pub fn points_of(&self, keyframes: &[usize]) -> Vec<PointId> {
+        let mut ids: Vec<PointId> = keyframes
             .iter()
-            .flat_map(|k| k.points.iter().flatten().copied())
+            .flat_map(|k| self.keyframes[*k].points.iter().flatten().copied())
             .collect();
         ids.sort_unstable();
         ids.dedup();
         ids
+    }
+
+    /// The map around a key frame (Pire 2017): itself, then those that see most of its points, then
+    /// those that see most points of these; at most `most` in all. Time plays no part, so that a
+    /// place seen again is the same place.
+    pub fn around(&self, keyframe: usize, most: usize) -> Vec<usize> {
+        let mut local = vec![keyframe];
+        let mut next = 0;
+        while next < local.len() && local.len() < most {
+            let mut shared = self.shared_with(local[next]);
+            shared.retain(|(k, _)| !local.contains(k));
+            let room = most - local.len();
+            local.extend(shared.iter().take(room).map(|(k, _)| *k));
+            next += 1;
+        }
+        local
+    }
+
+    /// Key frames that see points of another, and how many: those that share most first, and of
+    /// equals the latest.
+    pub fn shared_with(&self, keyframe: usize) -> Vec<(usize, usize)> {
+        let mut shared = BTreeMap::<usize, usize>::new();
+        let points = self.keyframes[keyframe].points.iter().flatten();
+        for point in points.filter_map(|id| self.points.get(id)) {
+            for (k, _) in point.observations.iter().filter(|(k, _)| *k != keyframe) {
+                *shared.entry(*k).or_default() += 1;
+            }
+        }
+        let mut shared: Vec<(usize, usize)> = shared.into_iter().collect();
+        shared.sort_by_key(|(k, count)| Reverse((*count, *k)));
+        shared
     }
 }

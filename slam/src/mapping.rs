@@ -12,24 +12,31 @@ use crate::patch::Patch;
 use crate::pose::Observation;
 use crate::tracker::Placement;
 
-/// Adds a key frame: sightings of known points, new points from the other stereo features, local
-/// bundle adjustment over the key frames from `local` on, culling.
+/// Adds a key frame to a part of the map: sightings of known points, new points from the other stereo
+/// features, local bundle adjustment over the key frames around it, culling.
 pub(crate) fn insert_keyframe(
     map: &mut Map,
     frame: &StereoFrame,
     seen: Seen,
     placement: &Placement,
-    local: usize,
+    submap: usize,
     rig: &RectifiedRig,
     config: &SlamConfig,
 ) {
-    let keyframe = add_keyframe(map, frame, &seen, placement);
+    let keyframe = add_keyframe(map, frame, &seen, placement, submap);
     add_new_points(map, keyframe, &frame.left, &seen, rig, config);
-    adjust_locally(map, local, rig, config);
+    let local = map.around(keyframe, config.window);
+    adjust_locally(map, &local, rig, config);
     cull(map, keyframe);
 }
 
-fn add_keyframe(map: &mut Map, frame: &StereoFrame, seen: &Seen, placement: &Placement) -> usize {
+fn add_keyframe(
+    map: &mut Map,
+    frame: &StereoFrame,
+    seen: &Seen,
+    placement: &Placement,
+    submap: usize,
+) -> usize {
     let mut features = seen.features[0].clone();
     for sighting in &placement.sightings {
         features.keypoints[sighting.feature] = sighting.at;
@@ -39,6 +46,7 @@ fn add_keyframe(map: &mut Map, frame: &StereoFrame, seen: &Seen, placement: &Pla
         frame: frame.index,
         name: frame.name.clone(),
         time: frame.time,
+        submap,
         T_cam_world: placement.T_cam_world,
         points: vec![None; features.keypoints.len()],
         features,
@@ -84,11 +92,11 @@ fn add_new_points(
     }
 }
 
-/// Bundle adjustment over the key frames from `local` on and what they see. Older key frames that
-/// see the same points hold the window in place; where there are none, its oldest does.
-fn adjust_locally(map: &mut Map, local: usize, rig: &RectifiedRig, config: &SlamConfig) {
+/// Bundle adjustment over key frames and what they see. Others that see the same points hold them in
+/// place; where there are none, the oldest does.
+fn adjust_locally(map: &mut Map, local: &[usize], rig: &RectifiedRig, config: &SlamConfig) {
     let ids: Vec<PointId> = map
-        .points_since(local)
+        .points_of(local)
         .into_iter()
         .filter(|id| map.points[id].observations.len() > 1)
         .collect();
@@ -101,7 +109,7 @@ fn adjust_locally(map: &mut Map, local: usize, rig: &RectifiedRig, config: &Slam
     let Some(oldest) = keyframes.first().copied() else {
         return;
     };
-    let border = oldest < local;
+    let border = keyframes.iter().any(|k| !local.contains(k));
     let positions: Vec<Point3<f64>> = ids.iter().map(|id| map.points[id].position).collect();
     let mut problem = BundleAdjustment {
         T_cam_world: keyframes
@@ -110,7 +118,10 @@ fn adjust_locally(map: &mut Map, local: usize, rig: &RectifiedRig, config: &Slam
             .collect(),
         fixed: keyframes
             .iter()
-            .map(|k| if border { *k < local } else { *k == oldest })
+            .map(|k| match border {
+                true => !local.contains(k),
+                false => *k == oldest,
+            })
             .collect(),
         points: positions,
         observations: Vec::new(),

@@ -80,6 +80,13 @@ impl Places {
         islands
     }
 
+    /// The key frames that look most like these descriptors, the likeliest first.
+    pub fn likeliest(&self, descriptors: &[Descriptor]) -> Vec<usize> {
+        let scores = self.scores(&self.vocabulary.bag(descriptors));
+        let scores: Vec<_> = scores.iter().map(|s| (*s > 0.0).then_some(*s)).collect();
+        islands_of(&scores).iter().map(|i| i.keyframe).collect()
+    }
+
     /// The score of each key frame with a bag: see [`BagOfWords::score`].
     fn scores(&self, bag: &BagOfWords) -> Vec<f64> {
         let mut scores = vec![0.0; self.bags.len()];

@@ -53,25 +53,44 @@ impl PoseGraph {
         }
     }
 
+    /// Covariance of each pose, zero for fixed ones: position and rotation vector, both along the axes
+    /// of the world, as the edges' deviations make it. `None` when the edges do not hold all poses.
+    pub fn covariances(&self) -> Option<Vec<Matrix6<f64>>> {
+        let (free, mut system) = self.system();
+        self.linearise(&free, &mut system);
+        let blocks = system.inverse_diagonal()?;
+        let in_world = |(pose, slot): (&Se3, &Option<usize>)| {
+            // Poses were moved by T exp(xi): along the axes of the camera.
+            let rotation = pose.rotation.to_rotation_matrix();
+            let mut turn = Matrix6::zeros();
+            for k in [0, 3] {
+                let mut block = turn.fixed_view_mut::<3, 3>(k, k);
+                block.copy_from(rotation.matrix());
+            }
+            slot.map_or_else(Matrix6::zeros, |k| turn * blocks[k] * turn.transpose())
+        };
+        Some(self.T_world_cam.iter().zip(&free).map(in_world).collect())
+    }
+
+    /// The number of each pose that is free, and the empty system for these.
+    fn system(&self) -> (Vec<Option<usize>>, BlockCholesky) {
+        let number = |next: &mut usize, fixed: &bool| {
+            let slot = (!fixed).then_some(*next);
+            *next += usize::from(!fixed);
+            Some(slot)
+        };
+        let free: Vec<Option<usize>> = self.fixed.iter().scan(0, number).collect();
+        let both = |e: &PoseEdge| Some((free[e.a]?, free[e.b]?));
+        let pairs = self.edges.iter().filter_map(both);
+        let system = BlockCholesky::new(free.iter().flatten().count(), pairs);
+        (free, system)
+    }
+
     fn minimise(&mut self, max_iterations: usize) {
-        let free: Vec<Option<usize>> = self
-            .fixed
-            .iter()
-            .scan(0, |next, fixed| {
-                let slot = (!fixed).then_some(*next);
-                *next += usize::from(!fixed);
-                Some(slot)
-            })
-            .collect();
-        let unknowns = free.iter().flatten().count();
-        let pairs = self
-            .edges
-            .iter()
-            .filter_map(|e| Some((free[e.a]?, free[e.b]?)));
-        let mut system = BlockCholesky::new(unknowns, pairs);
+        let (free, mut system) = self.system();
         let (mut current, mut lambda) = (self.cost(), 1e-6);
         for _ in 0..max_iterations {
-            let gradient = self.linearise(&free, unknowns, &mut system);
+            let gradient = self.linearise(&free, &mut system);
             system.damp(lambda);
             let Some(steps) = system.solve(&gradient) else {
                 lambda *= 10.0;
@@ -115,14 +134,9 @@ impl PoseGraph {
 
     /// Sums the Gauss-Newton matrix into `system` and gives half the gradient of the cost, for
     /// poses moved by `T exp(xi)`.
-    fn linearise(
-        &self,
-        free: &[Option<usize>],
-        unknowns: usize,
-        system: &mut BlockCholesky,
-    ) -> Vec<Vector6<f64>> {
+    fn linearise(&self, free: &[Option<usize>], system: &mut BlockCholesky) -> Vec<Vector6<f64>> {
         system.clear();
-        let mut gradient = vec![Vector6::zeros(); unknowns];
+        let mut gradient = vec![Vector6::zeros(); free.iter().flatten().count()];
         for edge in &self.edges {
             let residual = self.error(edge);
             let weight = huber_weight(residual.norm_squared(), edge.huber());
@@ -264,7 +278,7 @@ mod tests {
         let free: Vec<Option<usize>> = (0..5).map(Some).collect();
         let pairs: Vec<_> = graph.edges.iter().map(|e| (e.a, e.b)).collect();
         let mut system = BlockCholesky::new(5, pairs.into_iter());
-        let gradient = graph.linearise(&free, 5, &mut system);
+        let gradient = graph.linearise(&free, &mut system);
         let moved = |k: usize, axis: usize, by: f64| {
             let mut twist = Vector6::zeros();
             twist[axis] = by;

@@ -6,6 +6,7 @@ use std::time::Instant;
 use barchan_datasets::StereoFrame;
 use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
 use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
+use nalgebra::Matrix6;
 use serde::Serialize;
 
 use crate::features::FeatureDetector;
@@ -15,6 +16,7 @@ use crate::map::{Keyframe, Map};
 use crate::mapping::insert_keyframe;
 use crate::matching::{DisparityGate, MatchCounts};
 use crate::tracker::{Placement, Tracker};
+use crate::uncertainty::pose_covariances;
 use crate::vocabulary::Vocabulary;
 use crate::{SlamConfig, SlamError};
 
@@ -31,6 +33,8 @@ pub struct FrameReport {
     pub inliers: usize,
     /// Features with a disparity.
     pub stereo: usize,
+    /// Index of the frame at whose place the camera was found again, after it was lost.
+    pub found_again_at: Option<usize>,
     /// Why it is lost; empty when it is not.
     pub reason: String,
     /// Whether it became a key frame.
@@ -55,9 +59,13 @@ pub struct SlamResult {
     pub trajectory: Trajectory,
     /// Frame index, name and pose of each key frame.
     pub keyframes: Vec<(usize, String, StampedPose)>,
-    /// Positions in `keyframes` at which the map was begun anew after the camera was lost: how what
-    /// follows lies to what was before is a guess.
-    pub restarts: Vec<usize>,
+    /// Covariance of each of `keyframes` against the first of its part of the map, position and
+    /// rotation vector, along the axes of the world; `None` when there is no telling.
+    pub covariances: Option<Vec<Matrix6<f64>>>,
+    /// The part of the map that each of `keyframes` belongs to. A part begins where the map was begun
+    /// anew after the camera was lost: how parts lie to each other is a guess. A loop that joins two
+    /// makes them one.
+    pub submaps: Vec<usize>,
     /// The map.
     pub map: Map,
 }
@@ -84,8 +92,6 @@ pub struct Slam {
     most_inliers: usize,
     /// Frames lost in a row.
     lost: usize,
-    /// See [`SlamResult::restarts`].
-    restarts: Vec<usize>,
     loops: Option<LoopCloser>,
 }
 
@@ -109,7 +115,6 @@ impl Slam {
             placed: Vec::new(),
             most_inliers: 0,
             lost: 0,
-            restarts: Vec::new(),
         }
     }
 
@@ -136,6 +141,7 @@ impl Slam {
             name: frame.name.clone(),
             tracked: true,
             inliers: 0,
+            found_again_at: None,
             stereo: seen.stereo_count(),
             reason: String::new(),
             keyframe: false,
@@ -152,22 +158,32 @@ impl Slam {
             sightings: Vec::new(),
         };
 
-        let local = self.local_map();
-        if let Some(placement) = self.tracker.track(&seen, frame.time, &self.map, local) {
+        let newest = self.map.keyframes.len().checked_sub(1);
+        let local = newest.map_or(vec![], |k| self.map.around(k, self.config.window));
+        if let Some(placement) = self.tracker.track(&seen, frame.time, &self.map, &local) {
             report.inliers = placement.sightings.len();
             self.lost = 0;
             self.most_inliers = self.most_inliers.max(report.inliers);
             self.tracker.moved_to(placement.T_cam_world, frame.time);
             let few = self.config.keyframe_ratio * self.most_inliers as f64;
             if (report.inliers as f64) < few {
-                self.make_keyframe(frame, seen, &placement, &mut report)?;
+                let submap = newest.map_or(0, |k| self.map.keyframes[k].submap);
+                self.make_keyframe(frame, seen, &placement, submap, &mut report)?;
             } else {
                 self.place(frame.time, placement.T_cam_world);
             }
-        } else if self.map.keyframes.is_empty() && enough_stereo {
+        } else if newest.is_none() && enough_stereo {
             report.inliers = report.stereo;
             self.tracker.moved_to(T_predicted, frame.time);
-            self.make_keyframe(frame, seen, &guess, &mut report)?;
+            self.make_keyframe(frame, seen, &guess, 0, &mut report)?;
+        } else if let Some((place, placement)) = self.find_again(&seen) {
+            // What follows is tracked against this place: it is the newest key frame at once.
+            let submap = self.map.keyframes[place].submap;
+            report.found_again_at = Some(self.map.keyframes[place].frame);
+            report.inliers = placement.sightings.len();
+            self.lost = 0;
+            self.tracker.lost_at(placement.T_cam_world, frame.time);
+            self.make_keyframe(frame, seen, &placement, submap, &mut report)?;
         } else {
             report.tracked = false;
             report.reason = seen.describe();
@@ -176,8 +192,9 @@ impl Slam {
             if self.lost > self.config.restart_after && enough_stereo {
                 report.reason += "; the map begins anew here, at a pose that is a guess";
                 self.lost = 0;
-                self.restarts.push(self.map.keyframes.len());
-                self.make_keyframe(frame, seen, &guess, &mut report)?;
+                let parts = self.map.keyframes.iter().map(|k| k.submap + 1);
+                let new = parts.max().unwrap_or(0);
+                self.make_keyframe(frame, seen, &guess, new, &mut report)?;
             } else {
                 self.place(frame.time, T_predicted);
             }
@@ -204,21 +221,30 @@ impl Slam {
             };
             (k.frame, k.name.clone(), pose)
         };
+        let loops = self.loops.as_ref().map_or(&[][..], LoopCloser::edges);
         SlamResult {
+            covariances: pose_covariances(&self.map, loops, &self.rig, &self.config),
             trajectory: Trajectory {
                 poses: self.placed.iter().map(stamped).collect(),
             },
             keyframes: self.map.keyframes.iter().map(keyframe).collect(),
-            restarts: self.restarts,
+            submaps: self.map.keyframes.iter().map(|k| k.submap).collect(),
             map: self.map,
         }
     }
 
-    /// First of the key frames that tracking and adjustment look at: the last few, none from before
-    /// the map was begun anew.
-    fn local_map(&self) -> usize {
-        let last_few = self.map.keyframes.len().saturating_sub(self.config.window);
-        last_few.max(self.restarts.last().copied().unwrap_or(0))
+    /// Where a lost camera is, if it sees a place that the map has: the key frame of that place, and
+    /// the pose.
+    fn find_again(&self, seen: &Seen) -> Option<(usize, Placement)> {
+        let places = self
+            .loops
+            .as_ref()?
+            .likeliest(&seen.features[0].descriptors);
+        places.into_iter().find_map(|place| {
+            let local = self.map.around(place, self.config.window);
+            let placement = self.tracker.track_by_looks(seen, &self.map, &local)?;
+            Some((place, placement))
+        })
     }
 
     /// Dense disparity of the frame, stereo matches gated by it (Hong 2021, 3.2.3), and the frame
@@ -228,6 +254,7 @@ impl Slam {
         frame: &StereoFrame,
         mut seen: Seen,
         placement: &Placement,
+        submap: usize,
         report: &mut FrameReport,
     ) -> Result<(), SlamError> {
         report.keyframe = true;
@@ -241,21 +268,18 @@ impl Slam {
             report.matches = seen.matches;
         }
         let keyframe = self.map.keyframes.len();
-        let local = self
-            .local_map()
-            .max((keyframe + 1).saturating_sub(self.config.window));
         insert_keyframe(
             &mut self.map,
             frame,
             seen,
             placement,
-            local,
+            submap,
             &self.rig,
             &self.config,
         );
         if let Some(closer) = &mut self.loops {
             let dense = report.dense.as_ref().map(|d| &d.disparity);
-            report.loops = closer.close(&mut self.map, dense, &self.restarts);
+            report.loops = closer.close(&mut self.map, dense);
         }
         self.most_inliers = 0;
         let settled = self.map.keyframes[keyframe].T_cam_world;

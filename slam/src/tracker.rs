@@ -55,15 +55,13 @@ impl Tracker {
     /// it, optimise the pose; where that fails, match the newest key frames by looks alone, sample
     /// a pose and optimise that. `None` when neither finds a pose that enough points agree with.
     ///
-    /// `local` is the first key frame of the local map.
+    /// `local` are the key frames of the local map, the nearest first.
     #[allow(non_snake_case)]
-    pub fn track(&self, seen: &Seen, time: f64, map: &Map, local: usize) -> Option<Placement> {
-        const RECENT: usize = 3;
+    pub fn track(&self, seen: &Seen, time: f64, map: &Map, local: &[usize]) -> Option<Placement> {
         let T_predicted = self.predict(time);
-        let points = map.points_since(local);
-        let recent = map.points_since(local.max(map.keyframes.len().saturating_sub(RECENT)));
+        let points = map.points_of(local);
         self.track_by_projection(seen, map, &points, &T_predicted)
-            .or_else(|| self.track_by_looks(seen, map, &points, &recent))
+            .or_else(|| self.track_by_looks(seen, map, local))
     }
 
     /// The last pose moved on by the last velocity, scaled to the time that passed.
@@ -124,16 +122,12 @@ impl Tracker {
         })
     }
 
-    /// Matches recent points by descriptor alone and samples a pose: for jumps that no prediction
-    /// covers.
+    /// Matches points of the first few of `local` by descriptor alone, samples a pose and settles it
+    /// in all of `local`: for jumps that no prediction covers, and for places known from long ago.
     #[allow(non_snake_case)]
-    fn track_by_looks(
-        &self,
-        seen: &Seen,
-        map: &Map,
-        points: &[PointId],
-        recent: &[PointId],
-    ) -> Option<Placement> {
+    pub fn track_by_looks(&self, seen: &Seen, map: &Map, local: &[usize]) -> Option<Placement> {
+        const NEAREST: usize = 3;
+        let recent = map.points_of(&local[..local.len().min(NEAREST)]);
         let looks: Vec<Descriptor> = recent.iter().map(|id| map.points[id].descriptor).collect();
         let pairs: Vec<(PointId, usize)> = match_all(&looks, &seen.features[0], &self.config)
             .into_iter()
@@ -143,7 +137,7 @@ impl Tracker {
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
         let T_sampled = sample_pose(&self.rig, &observations, self.config.min_inliers, &mut rng)?;
         let rough = optimise_pose(&self.rig, &observations, &T_sampled);
-        self.settle(seen, map, points, &rough.T_cam_world)
+        self.settle(seen, map, &map.points_of(local), &rough.T_cam_world)
     }
 
     /// The last, narrow match around a pose that is nearly right, with sightings aligned to a

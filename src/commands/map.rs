@@ -34,6 +34,9 @@ pub struct Args {
     /// Fewest points of a voxel that is kept
     #[arg(long, default_value_t = MapConfig::default().min_points)]
     min_points: u32,
+    /// Which part of the map, by `submap` in keyframes.csv [default: the one of most key frames]
+    #[arg(long)]
+    submap: Option<usize>,
     /// Farthest accepted depth, metres [default: where depth is known to 10 %]
     #[arg(long, value_name = "M")]
     max_depth: Option<f64>,
@@ -118,7 +121,7 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let (rig, keyframes) = open_run(&args.run, args.poses.as_deref())?;
+    let (rig, keyframes) = open_run(&args.run, args.submap, args.poses.as_deref())?;
     let mut config = MapConfig {
         voxel: args.voxel,
         cell: args.cell,
@@ -293,7 +296,11 @@ impl KeyframeFiles {
 
 /// The rig and the key frames of a run: `keyframes.tum` has a line for every name, in order, in
 /// `keyframes/left`. `poses` replace those of the run; key frames they do not reach are left out.
-fn open_run(run: &Path, poses: Option<&Path>) -> Result<(RectifiedRig, Vec<KeyframeFiles>)> {
+fn open_run(
+    run: &Path,
+    submap: Option<usize>,
+    poses: Option<&Path>,
+) -> Result<(RectifiedRig, Vec<KeyframeFiles>)> {
     let trajectory = run.join("keyframes.tum");
     if !trajectory.is_file() {
         bail!(
@@ -326,6 +333,13 @@ fn open_run(run: &Path, poses: Option<&Path>) -> Result<(RectifiedRig, Vec<Keyfr
             folder.display()
         );
     }
+    let parts = read_submaps(run, estimated.len())?;
+    let largest = || {
+        let count = |part: &usize| parts.iter().filter(|p| *p == part).count();
+        // Of equals the first.
+        (parts.iter().copied().rev()).max_by_key(count).unwrap_or(0)
+    };
+    let part = submap.unwrap_or_else(largest);
     let others = poses
         .map(|file| Trajectory::read_tum(file).map(|t| (file, t)))
         .transpose()?;
@@ -336,6 +350,10 @@ fn open_run(run: &Path, poses: Option<&Path>) -> Result<(RectifiedRig, Vec<Keyfr
     };
     let mut keyframes = vec![];
     for (k, (name, mut pose)) in names.into_iter().zip(estimated).enumerate() {
+        // Poses from elsewhere say how the parts lie to each other.
+        if others.is_none() && parts[k] != part {
+            continue;
+        }
         if let Some((_, others)) = &others {
             match others.at(pose.time) {
                 Some(other) => pose.T_world_cam = other,
@@ -349,6 +367,12 @@ fn open_run(run: &Path, poses: Option<&Path>) -> Result<(RectifiedRig, Vec<Keyfr
             pose_covariance: covariances.as_ref().map(|c| c[k]),
         });
     }
+    if others.is_none() && keyframes.is_empty() {
+        bail!(
+            "{}: no key frame is of part {part} of the map\n  cure: see submap in keyframes.csv",
+            run.display()
+        );
+    }
     if let (Some((file, _)), true) = (&others, keyframes.is_empty()) {
         bail!(
             "{}: none of its times is that of a key frame of {}\n  cure: give both the same clock",
@@ -357,6 +381,25 @@ fn open_run(run: &Path, poses: Option<&Path>) -> Result<(RectifiedRig, Vec<Keyfr
         );
     }
     Ok((rig, keyframes))
+}
+
+/// The part of the map that each key frame belongs to: `keyframes.csv` of a run; all to one where
+/// there is none.
+fn read_submaps(run: &Path, keyframes: usize) -> Result<Vec<usize>> {
+    let file = run.join("keyframes.csv");
+    if !file.is_file() {
+        return Ok(vec![0; keyframes]);
+    }
+    let text = std::fs::read_to_string(&file).with_context(|| file.display().to_string())?;
+    let last_column = |line: &str| line.rsplit(',').next()?.trim().parse().ok();
+    let parts: Option<Vec<usize>> = text.lines().skip(1).map(last_column).collect();
+    match parts {
+        Some(parts) if parts.len() == keyframes => Ok(parts),
+        _ => bail!(
+            "{}: expected a line for each of {keyframes} key frames, with its submap last",
+            file.display()
+        ),
+    }
 }
 
 /// `covariance.csv` of a run, where there is one: a header, then a line for each key frame in order, the

@@ -113,13 +113,9 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
             "{lost} of {frames} frames are lost: where the camera was then is a guess."
         ));
     }
-    let restarts = summary
-        .get("restarts")
-        .and_then(Value::as_array)
-        .map_or(0, Vec::len);
-    if restarts > 0 {
+    if let Some(parts) = number("submaps").filter(|parts| *parts > 1.0) {
         report.warnings.push(format!(
-            "The map began anew {restarts} times: its parts are not joined, and how they lie to each other is a guess."
+            "The map is of {parts} parts that are not joined: how they lie to each other is a guess."
         ));
     }
 

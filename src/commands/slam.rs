@@ -1,3 +1,5 @@
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -69,7 +71,8 @@ struct Summary {
     keyframes: usize,
     loops: usize,
     loop_events: Vec<LoopEvent>,
-    restarts: Vec<usize>,
+    submaps: usize,
+    found_again: usize,
     points: usize,
     ms_track_median: f64,
     ms_track_p95: f64,
@@ -108,7 +111,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
         (0, vec![], vec![], MatchCounts::default());
     let mut total_ms = 0.0;
-    let mut loops = Vec::<LoopEvent>::new();
+    let (mut loops, mut found_again) = (Vec::<LoopEvent>::new(), 0);
     for frame in prefetch(source, (0..frames).collect(), 4) {
         let frame = frame?;
         let mut report = slam.track(&frame)?;
@@ -129,6 +132,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             ));
             loops.push(event.clone());
         });
+        if let Some(place) = report.found_again_at {
+            found_again += 1;
+            output.notice(&format!(
+                "frame {}: the camera was lost, and is found again at the place of frame {place}",
+                report.name
+            ));
+        }
         tracked += usize::from(report.tracked);
         track_ms.push(report.ms_track);
         total_ms += report.ms_track + report.ms_disparity;
@@ -146,11 +156,14 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     }
 
     let result = slam.finish();
-    if !result.restarts.is_empty() {
+    let submaps = result.submaps.iter().collect::<BTreeSet<_>>().len();
+    if submaps > 1 {
         output.notice(&format!(
-            "the map began anew at key frames {:?}: the parts are not joined, and how they lie to each other is a guess",
-            result.restarts
+            "the map is of {submaps} parts, and how they lie to each other is a guess: keyframes.csv says what belongs to which, and `barchan map` takes the largest"
         ));
+    }
+    if result.covariances.is_none() {
+        output.notice("how well the poses are known cannot be told: there is no covariance.csv");
     }
     write_result(&out, &result)?;
     let (ms_track_median, ms_track_p95) = percentiles(track_ms);
@@ -160,7 +173,8 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         keyframes: result.keyframes.len(),
         loops: loops.len(),
         loop_events: loops,
-        restarts: result.restarts.clone(),
+        submaps,
+        found_again,
         points: result.map.points.len(),
         ms_track_median,
         ms_track_p95,
@@ -236,6 +250,25 @@ fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
         poses: result.keyframes.iter().map(|(_, _, pose)| *pose).collect(),
     };
     out.write("keyframes.tum", keyframes.to_tum())?;
+    let mut table = String::from("frame,name,time,submap\n");
+    for ((frame, name, pose), submap) in result.keyframes.iter().zip(&result.submaps) {
+        writeln!(table, "{frame},{name},{},{submap}", pose.time)?;
+    }
+    out.write("keyframes.csv", table)?;
+    if let Some(covariances) = &result.covariances {
+        let mut table = String::from("time");
+        for (row, column) in (0..36).map(|k| (k / 6, k % 6)) {
+            write!(table, ",c{row}{column}")?;
+        }
+        for ((_, _, pose), covariance) in result.keyframes.iter().zip(covariances) {
+            write!(table, "\n{}", pose.time)?;
+            // Symmetric: rows are columns.
+            covariance
+                .iter()
+                .try_for_each(|c| write!(table, ",{c:e}"))?;
+        }
+        out.write("covariance.csv", table + "\n")?;
+    }
     let point = |p: &barchan_slam::MapPoint| CloudPoint {
         position: p.position,
         colour: p.colour,
