@@ -102,8 +102,6 @@ pub(crate) struct LoopCloser {
     rig: RectifiedRig,
     config: SlamConfig,
     places: Places,
-    /// Disparity of the features of each key frame that loops are proved with.
-    disparities: Vec<Vec<Option<f64>>>,
     /// Motions that closed loops measured.
     edges: Vec<PoseEdge>,
 }
@@ -122,8 +120,16 @@ impl LoopCloser {
             rig,
             config,
             places: Places::new(vocabulary),
-            disparities: Vec::new(),
             edges: Vec::new(),
+        }
+    }
+
+    /// Takes note of all key frames of a map that was made before.
+    pub fn learn(&mut self, map: &Map) {
+        for keyframe in &map.keyframes {
+            let least = self.config.loops.min_score;
+            self.places
+                .add(&keyframe.features.descriptors, least, |_| true);
         }
     }
 
@@ -138,7 +144,7 @@ impl LoopCloser {
         let Some(newest) = map.keyframes.len().checked_sub(1) else {
             return Vec::new();
         };
-        self.disparities.push(self.known_disparities(map, dense));
+        map.keyframes[newest].proof_disparities = self.known_disparities(map, dense);
         let connected = connected(map, newest);
         let loops = &self.config.loops;
         let skip = |k: usize| k + loops.min_gap > newest || connected.contains(&k);
@@ -211,7 +217,7 @@ impl LoopCloser {
 
         let (mut looks, mut places) = (Vec::<Descriptor>::new(), Vec::<Point3<f64>>::new());
         let features = old.features.keypoints.iter().zip(&old.features.descriptors);
-        for ((k, look), d) in features.zip(&self.disparities[island.keyframe]) {
+        for ((k, look), d) in features.zip(&old.proof_disparities) {
             let at = d.map(|d| StereoPoint { u: k.u, v: k.v, d });
             if let Some(place) = at.and_then(|at| self.rig.back_project(at)) {
                 looks.push(*look);
@@ -269,7 +275,7 @@ impl LoopCloser {
             sigma: k.scale,
             ..k
         };
-        let d = self.disparities[keyframe][feature];
+        let d = map.keyframes[keyframe].proof_disparities[feature];
         Observation::new(place, &at, d, self.config.disparity_sigma)
     }
 
@@ -466,6 +472,7 @@ mod tests {
                 bits: 256,
             },
             disparities: vec![None; 3],
+            proof_disparities: vec![None; 3],
             points: vec![None; 3],
         };
         let mut map = Map::default();

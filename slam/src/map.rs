@@ -31,6 +31,9 @@ pub struct Keyframe {
     pub features: Features,
     /// Disparity of each feature, where it was matched in the right image, pixels.
     pub disparities: Vec<Option<f64>>,
+    /// Disparity of each feature that loops are proved with: dense where that is wanted and known, else
+    /// that of its match, pixels.
+    pub proof_disparities: Vec<Option<f64>>,
     /// The map point that each feature sees.
     pub points: Vec<Option<PointId>>,
 }
@@ -59,7 +62,7 @@ pub struct Map {
     pub keyframes: Vec<Keyframe>,
     /// Points by name; ordered, so that every walk over them is the same.
     pub points: BTreeMap<PointId, MapPoint>,
-    next: PointId,
+    pub(crate) next: PointId,
 }
 
 impl Map {

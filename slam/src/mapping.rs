@@ -51,6 +51,7 @@ fn add_keyframe(
         points: vec![None; features.keypoints.len()],
         features,
         disparities: seen.disparities.clone(),
+        proof_disparities: seen.disparities.clone(),
     });
     for sighting in &placement.sightings {
         map.observe(keyframe, sighting.feature, sighting.point);

@@ -13,19 +13,41 @@ const INNER: usize = SIDE - 2;
 pub struct Patch {
     samples: [f32; SIDE * SIDE],
     /// Pixels between samples: the scale of the feature.
-    spacing: f64,
+    spacing: f32,
     /// Depth of the point when the patch was cut, metres.
-    depth: f64,
+    depth: f32,
 }
 
 impl Patch {
+    /// How many numbers a patch is made of.
+    pub(crate) const NUMBERS: usize = SIDE * SIDE + 2;
+
+    /// Samples, spacing and depth.
+    pub(crate) fn to_numbers(&self) -> [f32; Self::NUMBERS] {
+        std::array::from_fn(|k| match k.checked_sub(SIDE * SIDE) {
+            None => self.samples[k],
+            Some(0) => self.spacing,
+            Some(_) => self.depth,
+        })
+    }
+
+    /// The patch that these numbers are of; `None` when one of them is none.
+    pub(crate) fn from_numbers(numbers: &[f32]) -> Option<Self> {
+        let whole = numbers.len() == Self::NUMBERS && numbers.iter().all(|n| n.is_finite());
+        whole.then(|| Self {
+            samples: std::array::from_fn(|k| numbers[k]),
+            spacing: numbers[SIDE * SIDE],
+            depth: numbers[SIDE * SIDE + 1],
+        })
+    }
+
     /// Cuts a patch around a place of an image; `None` where it would leave the image.
     pub fn cut(image: &Plane, at: Vector2<f64>, spacing: f64, depth: f64) -> Option<Self> {
         let samples = sample::<{ SIDE * SIDE }>(image, at, spacing, RADIUS)?;
         Some(Self {
             samples,
-            spacing,
-            depth,
+            spacing: spacing as f32,
+            depth: depth as f32,
         })
     }
 
@@ -35,7 +57,7 @@ impl Patch {
     /// settle near the guess or does not look alike.
     pub fn find(&self, image: &Plane, guess: Vector2<f64>, depth: f64) -> Option<Vector2<f64>> {
         const LIKENESS: f32 = 0.85;
-        let spacing = self.spacing * self.depth / depth;
+        let spacing = f64::from(self.spacing) * f64::from(self.depth) / depth;
         let mut reference = [0.0f32; INNER * INNER];
         let mut gradient = [Vector2::<f32>::zeros(); INNER * INNER];
         for y in 0..INNER {

@@ -57,7 +57,7 @@ pub struct FrameReport {
 pub struct SlamResult {
     /// Every frame in order; a lost one has the pose that was predicted for it.
     pub trajectory: Trajectory,
-    /// Frame index, name and pose of each key frame.
+    /// Frame index, name and pose of each key frame that was made of these frames.
     pub keyframes: Vec<(usize, String, StampedPose)>,
     /// Covariance of each of `keyframes` against the first of its part of the map, position and
     /// rotation vector, along the axes of the world; `None` when there is no telling.
@@ -66,7 +66,7 @@ pub struct SlamResult {
     /// anew after the camera was lost: how parts lie to each other is a guess. A loop that joins two
     /// makes them one.
     pub submaps: Vec<usize>,
-    /// The map.
+    /// The map, with what was there before.
     pub map: Map,
 }
 
@@ -88,6 +88,8 @@ pub struct Slam {
     tracker: Tracker,
     map: Map,
     placed: Vec<Placed>,
+    /// Key frames of the map that were there before the first frame.
+    known: usize,
     /// Most inliers of a frame since the last key frame.
     most_inliers: usize,
     /// Frames lost in a row.
@@ -113,6 +115,7 @@ impl Slam {
             engine,
             map: Map::default(),
             placed: Vec::new(),
+            known: 0,
             most_inliers: 0,
             lost: 0,
         }
@@ -122,6 +125,17 @@ impl Slam {
     pub fn with_vocabulary(mut self, words: Vocabulary) -> Self {
         self.loops = (self.config.loops.enabled)
             .then(|| LoopCloser::new(self.rig, self.config.clone(), Arc::new(words)));
+        self
+    }
+
+    /// Goes on in a map made before, by the same rig and detector: the first frames are looked for in
+    /// it. To be called before the first frame; then `with_vocabulary` comes before.
+    pub fn with_map(mut self, map: Map) -> Self {
+        if let Some(closer) = &mut self.loops {
+            closer.learn(&map);
+        }
+        self.known = map.keyframes.len();
+        self.map = map;
         self
     }
 
@@ -221,14 +235,16 @@ impl Slam {
             };
             (k.frame, k.name.clone(), pose)
         };
+        let new = &self.map.keyframes[self.known..];
         let loops = self.loops.as_ref().map_or(&[][..], LoopCloser::edges);
         SlamResult {
-            covariances: pose_covariances(&self.map, loops, &self.rig, &self.config),
+            covariances: pose_covariances(&self.map, loops, &self.rig, &self.config)
+                .map(|all| all[self.known..].to_vec()),
             trajectory: Trajectory {
                 poses: self.placed.iter().map(stamped).collect(),
             },
-            keyframes: self.map.keyframes.iter().map(keyframe).collect(),
-            submaps: self.map.keyframes.iter().map(|k| k.submap).collect(),
+            keyframes: new.iter().map(keyframe).collect(),
+            submaps: new.iter().map(|k| k.submap).collect(),
             map: self.map,
         }
     }

@@ -6,7 +6,9 @@ use std::path::Path;
 
 use barchan_datasets::{StereoFrame, StereoSource, open};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
-use barchan_slam::{Detector, FrameReport, LoopEvent, Slam, SlamConfig, SlamError, SlamResult};
+use barchan_slam::{
+    Detector, FrameReport, LoopEvent, Map, Slam, SlamConfig, SlamError, SlamResult,
+};
 use block_matcher::BlockMatcher;
 
 fn slam(source: &dyn StereoSource) -> Slam {
@@ -279,4 +281,142 @@ fn a_frame_of_another_size_is_an_error_that_names_it() {
         ),
         "{error}"
     );
+}
+
+/// How far a tracked frame is from where it truly is, in a world where the first of `frames` is the
+/// origin, metres.
+fn off(
+    result: &SlamResult,
+    place: usize,
+    source: &dyn StereoSource,
+    first: usize,
+    index: usize,
+) -> f64 {
+    let truth = &source.true_trajectory().unwrap().poses;
+    let moved = truth[first].T_world_cam.inverse() * truth[index].T_world_cam;
+    let error = moved.inverse() * result.trajectory.poses[place].T_world_cam;
+    error.translation.vector.norm()
+}
+
+#[test]
+fn faults_of_the_field_are_survived() {
+    let source = open("synth:seed=4,frames=44,width=256,height=192").unwrap();
+    let lit = |mut f: StereoFrame, gain: f32| {
+        for image in [&mut f.left, &mut f.right] {
+            image.iter_mut().for_each(|v| *v = (*v * gain).min(1.0));
+        }
+        f
+    };
+    let mut played = Vec::new();
+    for f in frames(source.as_ref()) {
+        match f.index {
+            // Dropped.
+            10 | 20 | 21 => {}
+            // Delivered twice.
+            15 => played.extend([f.clone(), f]),
+            // A clock that jumps, and one that stands.
+            25.. if f.index < 28 => played.push(StereoFrame {
+                time: f.time + 3600.0,
+                ..f
+            }),
+            28..31 => played.push(StereoFrame { time: 2.8, ..f }),
+            // Exposure that halves, and one that blooms.
+            33 | 34 => played.push(lit(f, 0.5)),
+            37 | 38 => played.push(lit(f, 2.2)),
+            _ => played.push(f),
+        }
+    }
+    let indices: Vec<usize> = played.iter().map(|f| f.index).collect();
+    let (reports, result) = track(slam(source.as_ref()), played.into_iter());
+    for report in reports.iter().filter(|r| !r.tracked) {
+        println!("{} {}", report.frame, report.reason);
+    }
+    assert!(
+        tracked(&reports) + 2 >= reports.len(),
+        "{}",
+        tracked(&reports)
+    );
+    assert!(is_whole(&result));
+    for (place, index) in indices
+        .iter()
+        .enumerate()
+        .filter(|(p, _)| reports[*p].tracked)
+    {
+        let off = off(&result, place, source.as_ref(), 0, *index);
+        assert!(off < 0.03, "frame {index} is off by {off} m");
+    }
+}
+
+#[test]
+fn a_camera_carried_elsewhere_is_found_again() {
+    let source = open("synth:seed=6,frames=40,speed=1,width=256,height=192").unwrap();
+    let images: Vec<StereoFrame> = frames(source.as_ref()).collect();
+    // Covered while it is carried back to where it was long ago.
+    let covered = (0..2).map(|_| {
+        let mut f = images[39].clone();
+        f.left.iter_mut().for_each(|v| *v = 0.0);
+        f
+    });
+    let played = images
+        .iter()
+        .cloned()
+        .chain(covered)
+        .chain(images[6..14].iter().cloned());
+    let (reports, result) = track(slam(source.as_ref()), played);
+    assert!(is_whole(&result));
+    let found = reports.iter().position(|r| r.found_again_at.is_some());
+    assert!(matches!(found, Some(42 | 43)), "{found:?}");
+    for (place, index) in (44..50).zip(8..14) {
+        assert!(reports[place].tracked);
+        let off = off(&result, place, source.as_ref(), 0, index);
+        assert!(off < 0.05, "frame {index} is off by {off} m");
+    }
+}
+
+#[test]
+fn a_later_run_goes_on_in_the_map() {
+    let source = open("synth:seed=6,frames=24,width=256,height=192").unwrap();
+    let images: Vec<StereoFrame> = frames(source.as_ref()).collect();
+    let (_, first) = track(slam(source.as_ref()), images.iter().cloned());
+    let bytes = first.map.to_bytes(source.rig()).unwrap();
+    let map = Map::from_bytes(&bytes, source.rig()).unwrap();
+    let known = map.keyframes.len();
+    let later = slam(source.as_ref()).with_map(map);
+    let (reports, result) = track(later, images[9..20].iter().cloned());
+    assert_eq!(tracked(&reports), 11);
+    assert!(is_whole(&result));
+    assert_eq!(result.map.keyframes.len() - known, result.keyframes.len());
+    for (place, index) in (9..20).enumerate() {
+        let off = off(&result, place, source.as_ref(), 0, index);
+        assert!(off < 0.02, "frame {index} is off by {off} m");
+    }
+}
+
+#[test]
+fn stated_deviations_of_poses_hold_the_errors() {
+    let (mut squared, mut count) = (0.0, 0.0);
+    for seed in 1..4 {
+        let spec = format!("synth:seed={seed},speed=1,frames=40,width=256,height=192");
+        let source = open(&spec).unwrap();
+        let (_, result) = track(slam(source.as_ref()), frames(source.as_ref()));
+        let truth = &source.true_trajectory().unwrap().poses;
+        let covariances = result.covariances.unwrap();
+        assert_eq!(covariances.len(), result.keyframes.len());
+        let world = truth[0].T_world_cam;
+        for ((frame, _, pose), covariance) in result.keyframes.iter().zip(&covariances).skip(1) {
+            let error = (world.inverse() * truth[*frame].T_world_cam)
+                .translation
+                .vector
+                - pose.T_world_cam.translation.vector;
+            let block = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+            let squared_deviations = error.dot(&(block.try_inverse().unwrap() * error));
+            assert!(squared_deviations < 27.0, "{frame}: {error} {block}");
+            squared += squared_deviations;
+            count += 3.0;
+        }
+    }
+    // One for deviations that are just right.
+    let ratio = squared / count;
+    println!("squared error over variance: {ratio}");
+    assert!((0.03..2.0).contains(&ratio), "{ratio}");
 }

@@ -6,9 +6,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
-use barchan_geometry::{Rig, Trajectory};
+use barchan_geometry::{RectifiedRig, Rig, Trajectory};
 use barchan_infer::DisparityMap;
-use barchan_slam::{Detector, LoopEvent, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary};
+use barchan_slam::{
+    Detector, LoopEvent, Map, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary,
+};
 use barchan_terrain::{Cloud, CloudPoint};
 use clap::Parser;
 use serde::Serialize;
@@ -24,6 +26,8 @@ use crate::output::{Output, StagedDir, percentiles};
     barchan slam --data images/ --model a.onnx --out runs/s\n  \
     barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
     barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
+    barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday
+  \
     barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
@@ -45,6 +49,9 @@ pub struct Args {
     /// Visual words to recognise places by, from `barchan vocabulary` or DBoW2, instead of the shipped
     #[arg(long, value_name = "FILE")]
     vocabulary: Option<PathBuf>,
+    /// Goes on in the map of an earlier run: its map.safetensors. The poses are then in that world
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -102,9 +109,13 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         std::fs::File::create(&log).with_context(|| log.display().to_string())?,
     );
 
-    let mut slam = Slam::new(*source.rig(), config, Some(engine));
+    let (rig, detector) = (*source.rig(), config.detector);
+    let mut slam = Slam::new(rig, config, Some(engine));
     if let Some(words) = words {
         slam = slam.with_vocabulary(words);
+    }
+    if let Some(file) = &args.map {
+        slam = slam.with_map(read_map(file, &rig, detector)?);
     }
     let frames = source.len();
     let bar = output.progress("slam", frames);
@@ -166,6 +177,8 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         output.notice("how well the poses are known cannot be told: there is no covariance.csv");
     }
     write_result(&out, &result)?;
+    let map = result.map.to_bytes(&rig)?;
+    out.write("map.safetensors", map)?;
     let (ms_track_median, ms_track_p95) = percentiles(track_ms);
     let summary = Summary {
         frames,
@@ -229,6 +242,23 @@ fn vocabulary(path: &Path, detector: Detector) -> Result<Vocabulary> {
         );
     }
     Ok(words)
+}
+
+fn read_map(file: &Path, rig: &RectifiedRig, detector: Detector) -> Result<Map> {
+    let context = || file.display().to_string();
+    let bytes = std::fs::read(file).with_context(context)?;
+    let map = Map::from_bytes(&bytes, rig).with_context(context)?;
+    let bits = map.keyframes.iter().map(|k| k.features.bits.div_ceil(8));
+    if bits
+        .max()
+        .is_some_and(|b| b as usize != detector.descriptor_bytes())
+    {
+        bail!(
+            "{}: its features are of another kind\n  cure: give --features as in the run that made it",
+            file.display()
+        );
+    }
+    Ok(map)
 }
 
 /// Files that sort as their key frames follow each other.
