@@ -6,7 +6,7 @@ use barchan_eval::trajectory::{DEFAULT_TOLERANCE, associate, umeyama};
 use barchan_geometry::Trajectory;
 use barchan_geometry::nalgebra::{Point3, Vector3};
 use barchan_report::{Chart, Cloud3d, Relief, Report, Series, Style};
-use barchan_terrain::{Cloud, Raster};
+use barchan_terrain::{Cloud, Grid, Raster};
 use clap::Parser;
 use serde::Serialize;
 use serde_json::Value;
@@ -169,6 +169,18 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
             },
         ],
     });
+    for event in summary["loop_events"].as_array().into_iter().flatten() {
+        let place = &event["earlier_frame"];
+        let moved = event["moved"].as_f64().unwrap_or_default();
+        let what = format!(
+            "sees the place of frame {place} again: {} points agree, the loop moves it by {moved:.3} m",
+            event["map_points"][1]
+        );
+        report.events.push((
+            format!("{:06}", event["frame"].as_u64().unwrap_or_default()),
+            what,
+        ));
+    }
     // The first frame of each stretch that is lost.
     let mut before = true;
     for frame in &frames {
@@ -272,6 +284,26 @@ fn add_pictures(report: &mut Report, slam: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Half the distance from the lower to the upper bound, in the cells of a grid; `None` where the file is
+/// not there or has no bounds.
+fn half_bands(file: &Path, grid: &Grid) -> Result<Option<Raster<f32>>> {
+    if !file.is_file() {
+        return Ok(None);
+    }
+    let bands = Raster::<f32>::read_bands(file)?;
+    let band = |name: &str| bands.iter().find(|(n, _)| n == name).map(|(_, b)| b);
+    let (Some(lower), Some(upper)) = (band("lower"), band("upper")) else {
+        return Ok(None);
+    };
+    let half = lower.values.iter().zip(&upper.values);
+    let half = Raster {
+        grid: lower.grid,
+        crs: lower.crs.clone(),
+        values: half.map(|(low, high)| 0.5 * (high - low)).collect(),
+    };
+    Ok(Some(half.onto(grid)))
+}
+
 /// Cloud and relief.
 fn add_map(report: &mut Report, map: &Path, slam: &Path) -> Result<()> {
     let summary = read_json(&map.join("summary.json"))?;
@@ -296,10 +328,11 @@ fn add_map(report: &mut Report, map: &Path, slam: &Path) -> Result<()> {
         points: Cloud::read_ply(&map.join("cloud.ply"))?.points,
         route: route.iter().map(place).collect(),
     });
+    let elevation = Raster::read(&map.join("dem.tif"))?;
     report.relief = Some(Relief {
-        elevation: Raster::read(&map.join("dem.tif"))?,
+        bound: half_bands(&map.join("elevation.tif"), &elevation.grid)?,
         shade: Raster::read(&map.join("hillshade.tif"))?,
-        bound: None,
+        elevation,
     });
     report.source = format!("{} and {}", slam.display(), map.display());
     Ok(())
