@@ -90,7 +90,7 @@ pub struct Slam {
     placed: Vec<Placed>,
     /// Key frames of the map that were there before the first frame.
     known: usize,
-    /// Most inliers of a frame since the last key frame.
+    /// Most inliers of a frame since the last key frame, that one included.
     most_inliers: usize,
     /// Frames lost in a row.
     lost: usize,
@@ -297,7 +297,7 @@ impl Slam {
             let dense = report.dense.as_ref().map(|d| &d.disparity);
             report.loops = closer.close(&mut self.map, dense);
         }
-        self.most_inliers = 0;
+        self.most_inliers = report.inliers;
         let settled = self.map.keyframes[keyframe].T_cam_world;
         self.tracker.corrected_to(settled);
         self.place(frame.time, settled);
