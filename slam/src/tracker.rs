@@ -145,7 +145,8 @@ impl Tracker {
     ///
     /// Sand looks like sand: near a false pose a third of the points still find a corner that could
     /// be theirs. So a count proves nothing; a true pose explains most matches (four in five, where
-    /// false ones were seen to explain half), and more than a few of the points in view.
+    /// false ones were seen to explain half), and more than a few of the points in view. When a fast
+    /// motion leaves few matches, these must agree better than half of them could by chance.
     #[allow(non_snake_case)]
     fn settle(
         &self,
@@ -172,9 +173,12 @@ impl Tracker {
         let pose = optimise_pose(&self.rig, &observations, T_rough);
         let count = pose.count();
         let explains = |share: f64, of: usize| count as f64 >= share * of as f64;
+        // Five deviations of a binomial distribution with an even chance.
+        let n = matches.pairs.len() as f64;
+        let beyond_chance = count as f64 - 0.5 * n > 5.0 * (0.25 * n).sqrt();
         let holds = count >= self.config.min_inliers
             && explains(self.config.min_match_share, matches.pairs.len())
-            && explains(self.config.min_view_share, matches.in_view);
+            && (explains(self.config.min_view_share, matches.in_view) || beyond_chance);
         let inliers = sightings.into_iter().zip(&pose.inliers);
         holds.then(|| Placement {
             T_cam_world: pose.T_cam_world,
