@@ -2,18 +2,32 @@
 
 use barchan_datasets::Plane;
 use barchan_geometry::RectifiedRig;
+use multiversion::multiversion;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Descriptor, Features};
 use crate::{Keypoint, SlamConfig};
 
 /// Differing bits of two descriptors.
+#[inline(always)]
 pub fn hamming(a: &Descriptor, b: &Descriptor) -> u32 {
     let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
     a.iter()
         .zip(b)
         .map(|(x, y)| (u64::from_ne_bytes(*x) ^ u64::from_ne_bytes(*y)).count_ones())
         .sum()
+}
+
+/// Differing bits of a descriptor and each of many.
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512vpopcntdq+popcnt",
+    "x86_64+avx2+popcnt",
+    "aarch64+neon"
+))]
+fn distances(descriptor: &Descriptor, all: &[Descriptor], into: &mut Vec<u32>) {
+    into.clear();
+    into.extend(all.iter().map(|other| hamming(descriptor, other)));
 }
 
 /// How many stereo matches each rule decided (Hong 2021, table 1).
@@ -136,19 +150,25 @@ pub(crate) fn two_nearest(
     let all: Vec<(u32, usize)> = candidates
         .map(|i| (hamming(descriptor, &features.descriptors[i]), i))
         .collect();
-    let (distance, best) = *all.iter().min()?;
+    nearest_and_rival(all.iter().copied(), features)
+}
+
+/// Of distances and features, what [`two_nearest`] gives.
+fn nearest_and_rival(
+    all: impl Iterator<Item = (u32, usize)> + Clone,
+    features: &Features,
+) -> Option<(usize, u32, u32)> {
+    let (distance, best) = all.clone().min()?;
     let at = features.keypoints[best];
     let elsewhere = |i: usize| {
         let k = features.keypoints[i];
         (k.u - at.u).abs() > 3.0 || (k.v - at.v).abs() > 3.0
     };
-    let second = all
-        .iter()
-        .filter(|(_, i)| elsewhere(*i))
-        .map(|(d, _)| *d)
-        .min()
-        .unwrap_or(features.bits);
-    Some((best, distance, second))
+    let rival = all.fold(features.bits, |least, (d, i)| {
+        // Most are farther than the rival so far, and need no look at where they are.
+        if d < least && elsewhere(i) { d } else { least }
+    });
+    Some((best, distance, rival))
 }
 
 /// Zero-mean correlation of an 11x11 window along the row around the coarse match, and a parabola
@@ -240,9 +260,12 @@ pub(crate) fn match_all(
 ) -> Vec<(usize, usize)> {
     let max_hamming = config.max_hamming(b.bits);
     let forward: Vec<Option<(usize, u32)>> = a
-        .iter()
-        .map(|descriptor| {
-            let (best, distance, second) = two_nearest(descriptor, 0..b.descriptors.len(), b)?;
+        .par_iter()
+        .with_min_len(64)
+        .map_init(Vec::new, |all, descriptor| {
+            distances(descriptor, &b.descriptors, all);
+            let numbered = all.iter().copied().zip(0..);
+            let (best, distance, second) = nearest_and_rival(numbered, b)?;
             (distance <= max_hamming && f64::from(distance) < config.nndr * f64::from(second))
                 .then_some((best, distance))
         })
