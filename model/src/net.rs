@@ -43,6 +43,7 @@ impl Preset {
                     groups: [2, 4],
                     channels: [16, 16],
                     blocks: [0, 1, 1],
+                    finest: 0,
                 }),
                 up_sampling: 16,
                 refinement: 0,
@@ -56,6 +57,7 @@ impl Preset {
                     groups: [2, 8],
                     channels: [32, 48],
                     blocks: [0, 2, 1],
+                    finest: 16,
                 }),
                 up_sampling: 32,
                 refinement: 48,
@@ -141,6 +143,7 @@ impl NetConfig {
         match &self.aggregation {
             AggregationConfig::Planar(c) => {
                 channels.extend(c.matching.iter().chain(&c.groups).chain(&c.channels));
+                channels.push(c.finest.max(1));
                 let divides = |level: usize| {
                     c.groups[level] > 0 && c.matching[level].is_multiple_of(c.groups[level])
                 };

@@ -28,6 +28,9 @@ pub struct PlanarConfig {
     pub channels: [usize; 2],
     /// Residual blocks at 1/8 on the way down, at 1/16, and at 1/8 on the way up.
     pub blocks: [usize; 3],
+    /// Channels of two bins at 1/4 on the way up; 0 stops at 1/8. Multiples of 16 suit the machine.
+    #[serde(default)]
+    pub finest: usize,
 }
 
 /// A convolution over disparity alone, as `Conv1d` of PyTorch has it.
@@ -106,6 +109,57 @@ impl Block {
     }
 }
 
+/// The last step of the way up: sharp outlines are decided at 1/4 of the resolution, where the costs and the image
+/// both still have them. Two bins share their channels, as at 1/8, so that all layers work on wide groups.
+#[derive(Module, Debug)]
+struct Finest {
+    up: Conv2d,
+    raw: Conv2d,
+    around: Conv2d,
+    gate: Conv2d,
+    out: DisparityMix,
+}
+
+impl Finest {
+    /// From `eighth` channels a bin at 1/8, `raw` costs a bin and `context` features at 1/4.
+    fn init(channels: usize, eighth: usize, raw: usize, context: usize, device: &Device) -> Self {
+        Self {
+            up: conv1x1([eighth, 4 * channels], device),
+            raw: conv1x1([2 * raw, channels], device),
+            around: conv3x3([channels, channels], 1, device),
+            gate: conv1x1([context, channels], device),
+            // Small, so that what is known at 1/8 speaks first.
+            out: DisparityMix::init([channels, 2], 3, 0.1, device),
+        }
+    }
+
+    /// What is added to the logits `[B, 2 bins, H/4, W/4]`.
+    fn forward<O: Ops>(
+        &self,
+        ops: &mut O,
+        bins: usize,
+        eighth: &O::Map,
+        raw: &O::Map,
+        seen: &O::Map,
+    ) -> O::Map {
+        let name = |layer: &str| format!("aggregation.finest.{layer}");
+        let up = ops.conv2d_per_bin(&name("up"), &self.up, bins, eighth);
+        let up = ops.depth_to_space(2, &up);
+        let raw = ops.conv2d_per_bin(&name("raw"), &self.raw, bins, raw);
+        let x = ops.add(&up, &raw);
+        let x = ops.relu(&x);
+        let around = ops.conv2d_per_bin(&name("around"), &self.around, bins, &x);
+        let x = ops.add(&x, &around);
+        let x = ops.relu(&x);
+        // The image says on which side of a pixel its surface goes on.
+        let gate = ops.conv2d(&name("gate"), &self.gate, seen);
+        let gate = ops.sigmoid(&gate);
+        let gate = ops.repeat_channels(bins, &gate);
+        let x = ops.mul(&x, &gate);
+        ops.disparity_mix(&name("out"), &self.out, bins, &x)
+    }
+}
+
 /// Correlation at 1/4 and 1/8, census beside it, an encoder-decoder over 1/8 and 1/16, and beside it one
 /// linear mix of the raw costs, which starts as census matching: an untrained network already matches blocks,
 /// and training refines that.
@@ -122,6 +176,7 @@ pub struct Planar {
     gate: Conv2d,
     decoder: Vec<Block>,
     out: DisparityMix,
+    finest: Option<Finest>,
     matching: DisparityMix,
     #[module(skip)]
     config: PlanarConfig,
@@ -154,6 +209,8 @@ impl Planar {
             decoder: blocks(config.blocks[2], eighth),
             // Two bins of 2x2 pixels. Small, so that matching speaks first.
             out: DisparityMix::init([eighth, 8], 3, 0.1, device),
+            finest: (config.finest > 0)
+                .then(|| Finest::init(config.finest, eighth, raw, features[0], device)),
             matching,
             config: config.clone(),
         }
@@ -218,7 +275,12 @@ impl Planar {
             up = block.forward(ops, &name(&format!("decoder.{i}")), bins8, &up);
         }
         let learned = ops.disparity_mix(&name("out"), &self.out, bins8, &up);
-        let learned = ops.depth_to_space(2, &learned);
+        let mut learned = ops.depth_to_space(2, &learned);
+        if let Some(finest) = &self.finest {
+            let (seen, _) = ops.halves(&features.quarter);
+            let finer = finest.forward(ops, bins8, &up, &raw, &seen);
+            learned = ops.add(&learned, &finer);
+        }
         let matching = ops.disparity_mix(&name("matching"), &self.matching, bins, &raw);
         ops.add(&learned, &matching)
     }

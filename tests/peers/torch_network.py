@@ -200,6 +200,23 @@ class Block(nn.Module):
         return F.relu(x + self.mix(F.relu(self.spatial(x))))
 
 
+class Finest(nn.Module):
+    """What 1/4 of the resolution adds to the logits; two bins at a time."""
+
+    def __init__(self, channels: int, wide: int, raw: int, context: int):
+        super().__init__()
+        self.up = PerBin(wide, 4 * channels, 1)
+        self.raw = PerBin(raw, channels, 1, merges=2)
+        self.around = PerBin(channels, channels, 3)
+        self.gate = nn.Conv2d(context, channels, 1)
+        self.out = DisparityMix(channels, 2, 3)
+
+    def forward(self, x: Tensor, raw: Tensor, seen: Tensor) -> Tensor:
+        x = F.relu(unfold_channels(self.up(x), 1, 2, 2) + self.raw(raw))
+        x = F.relu(x + self.around(x)) * self.gate(seen).sigmoid().unsqueeze(2)
+        return unfold_channels(self.out(x), 2, 1, 1)
+
+
 class Planar(nn.Module):
     """Presets tiny and rover: correlation, an encoder-decoder of split 3-D convolutions over 1/8 and 1/16,
     and beside it one linear mix of the raw costs."""
@@ -223,6 +240,7 @@ class Planar(nn.Module):
         self.gate = nn.Conv2d(eighth, wide, 1)
         self.decoder = nn.Sequential(*[Block(wide) for _ in range(decoder)])
         self.out = DisparityMix(wide, 8, 3)
+        self.finest = Finest(config.get("finest", 0), wide, raw, quarter) if config.get("finest", 0) else None
         self.matching = DisparityMix(raw, 1, 3)
 
     def forward(self, quarter: tuple, eighth: tuple, images: tuple, bins: int) -> Tensor:
@@ -241,7 +259,10 @@ class Planar(nn.Module):
         # What the left image shows decides which of the costs count there.
         gate = self.gate(eighth[0]).sigmoid().unsqueeze(2)
         x = self.decoder(F.relu(y + x) * gate)
-        return (unfold_channels(self.out(x), 2, 2, 2) + self.matching(raw)).squeeze(1)
+        logits = unfold_channels(self.out(x), 2, 2, 2) + self.matching(raw)
+        if self.finest is not None:
+            logits = logits + self.finest(x, raw, quarter[0])
+        return logits.squeeze(1)
 
 
 class Volumetric(nn.Module):
