@@ -90,7 +90,7 @@ impl Default for SlamConfig {
             akaze_threshold: 1e-5,
             nndr: 0.75,
             max_hamming_share: 0.25,
-            akaze_max_hamming_share: 0.2,
+            akaze_max_hamming_share: 0.16,
             row_tolerance: 1.5,
             min_disparity: 1.5,
             disparity_sigma: 2.0,

@@ -1,12 +1,13 @@
 use std::path::Path;
 
 use anyhow::Result;
-use barchan_infer::{DisparityEngine, Runtime};
+use barchan_infer::{BurnEngine, DisparityEngine, Runtime};
+use barchan_model::Device;
 use barchan_train::DeviceName;
 use clap::Parser;
 use serde::Serialize;
 
-use crate::engine::load_engine;
+use crate::engine::load_net;
 use crate::output::Output;
 
 /// Say what is installed, what works, and how to get the rest
@@ -65,7 +66,8 @@ pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
 
 /// Runs the shipped network on a small grey pair.
 fn try_shipped() -> Result<String> {
-    let mut engine: Box<dyn DisparityEngine> = load_engine("tiny", None, 0)?;
+    let device = Device::flex();
+    let mut engine = BurnEngine::new(load_net("tiny", &device)?, device, "tiny");
     let grey = barchan_datasets::Rgb::from_pixel(64, 48, image::Rgb([0.5; 3]));
     engine.disparity(&grey, &grey)?;
     Ok("tiny".into())

@@ -17,7 +17,7 @@ pub use contract::{
 };
 pub(crate) use contract::{MOST_AREA, MOST_SIDE};
 pub use runtime::Runtime;
-pub(crate) use runtime::open;
+pub(crate) use runtime::{open, open_bytes};
 
 use crate::engine::check_sizes;
 use crate::{DisparityEngine, DisparityMap, InferError};
@@ -74,6 +74,21 @@ impl OnnxEngine {
             )));
         };
         Ok(Self::with_contract(session, contract, path))
+    }
+
+    /// Runs the bytes of a file that `barchan export` would write; `name` stands in results and errors.
+    ///
+    /// # Errors
+    /// When ONNX Runtime does not take them.
+    pub fn of_export(
+        runtime: &Runtime,
+        bytes: Vec<u8>,
+        name: &str,
+        threads: usize,
+    ) -> Result<Self, InferError> {
+        let path = Path::new(name);
+        let session = open_bytes(runtime, bytes.into(), path, threads)?;
+        Ok(Self::with_contract(session, Contract::own(), path))
     }
 
     /// An engine on a session that is open.

@@ -108,7 +108,21 @@ pub(crate) fn open(runtime: &Runtime, path: &Path, threads: usize) -> Result<Ses
             "has {size} bytes, and no ONNX file has more than {MOST_BYTES}"
         )));
     }
-    let bytes = Bytes::from(std::fs::read(path).map_err(|e| wrong(e.to_string()))?);
+    let bytes = std::fs::read(path).map_err(|e| wrong(e.to_string()))?;
+    open_bytes(runtime, bytes.into(), path, threads)
+}
+
+/// Opens the bytes of an ONNX file; `path` names it in errors.
+pub(crate) fn open_bytes(
+    runtime: &Runtime,
+    bytes: Bytes,
+    path: &Path,
+    threads: usize,
+) -> Result<Session, InferError> {
+    let wrong = |message: String| InferError::Model {
+        path: path.to_owned(),
+        message,
+    };
     let with_cure = |message: String| match message.contains("cure:") {
         true => wrong(message),
         false => wrong(format!(

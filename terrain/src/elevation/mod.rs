@@ -80,7 +80,8 @@ pub struct ElevationConfig {
     pub hits: Hits,
     /// Smallest variance of a height, square metres. Default 9e-6, (3 mm)^2.
     pub min_variance: f64,
-    /// Largest variance of a measurement that is fused, square metres. Default 0.01, (0.1 m)^2.
+    /// Largest variance, as the sensor makes it, of a measurement that is fused, square metres; what the
+    /// pose may be off widens the bounds and leaves nothing out. Default 0.01, (0.1 m)^2.
     pub max_variance: f64,
     /// Smallest deviation of a cell's place, metres. Default half a cell.
     pub min_horizontal: Option<f64>,
@@ -249,6 +250,8 @@ impl Window {
 /// A measurement of one cell's height.
 struct Measurement {
     height: f64,
+    /// Of the variance, what is not the pose's.
+    by_sensor: f64,
     random: f64,
     systematic: f64,
     linear_rgb: [f32; 3],
@@ -539,7 +542,7 @@ impl ElevationMap {
         let config = &self.config;
         let variance = m.random + m.systematic;
         // Not written with >, so that NaN is refused too.
-        if !(m.height.is_finite() && variance <= config.max_variance) {
+        if !(m.height.is_finite() && variance.is_finite() && m.by_sensor <= config.max_variance) {
             return;
         }
         let cell = &mut self.cells[slot];
@@ -742,10 +745,10 @@ fn measure(scan: &Scan, config: &ElevationConfig, bin: &Bin, slope: &[f64; 2]) -
     let variance = |m: &Matrix3<f64>| (in_sensor * m * in_sensor.transpose())[0];
     let mut random = variance(&covariance.random);
     let mut systematic = variance(&covariance.systematic);
-    if let Some(pose) = &scan.pose_covariance {
+    let pose = scan.pose_covariance.map_or(0.0, |pose| {
         let j = normal * pose_jacobian(&(rotation * mean.position.coords));
-        systematic += (j * pose * j.transpose())[0];
-    }
+        (j * pose * j.transpose())[0]
+    });
     let n = f64::from(bin.points);
     if config.slopes {
         // How heights vary within the cell: by its slope, or by what the scan saw if that is more (a
@@ -755,8 +758,11 @@ fn measure(scan: &Scan, config: &ElevationConfig, bin: &Bin, slope: &[f64; 2]) -
         let spread = bin.height2 / n - above_sensor * above_sensor;
         random += spread.max((rise * config.cell).powi(2) / 12.0);
     }
+    let by_sensor = random + systematic;
+    systematic += pose;
     Measurement {
         height: bin.height / n,
+        by_sensor,
         random,
         systematic,
         linear_rgb: bin.linear_rgb.map(|c| c / bin.points as f32),
