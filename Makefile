@@ -29,7 +29,7 @@ TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/li
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch weights peers accuracy peers-torch onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -65,7 +65,7 @@ lint: ## format, clippy and documentation, warnings denied
 bench: onnxruntime ## timings of the main job, step by step
 	cargo bench --workspace --bench main_job $(CARGO_FLAGS)
 
-peers: build onnxruntime $(PEERS)/ready ## outputs against other people's programs: ONNX Runtime, evo, GDAL, OpenCV
+peers: build onnxruntime $(PEERS)/ready ## outputs against other people's programs: ONNX Runtime, evo, GDAL, OpenCV, Open3D (0.6 GB to fetch)
 	$(PEERS)/bin/python tests/peers/run.py --barchan "$(BARCHAN)"
 
 $(PEERS)/ready: tests/peers/requirements.txt

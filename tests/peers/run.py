@@ -1,8 +1,8 @@
 """barchan's outputs against programs nobody here wrote. `make peers` runs this.
 
 Trains for a moment on a rendered traverse, exports, infers, tracks and maps, and holds every file
-against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile, laspy, pypcd4, small_gicp and a browser. Real
-images and published trajectories join where ../shared/data has them. Exits 1 when a figure is out of
+against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile, laspy, pypcd4, Open3D, small_gicp and a browser.
+Real images and published trajectories join where ../shared/data has them. Exits 1 when a figure is out of
 bounds or a check fails to run.
 """
 
