@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::features::Descriptor;
 use crate::map::{Map, PointId};
-use crate::matching::{Grid, match_all, match_projections};
+use crate::matching::{Grid, find_points, match_all};
 use crate::places::{Island, Places};
 use crate::pose::{Observation, optimise_pose, sample_pose};
 use crate::pose_graph::{PoseEdge, PoseGraph};
@@ -289,28 +289,19 @@ impl LoopCloser {
         T_cam_world: &Se3,
     ) -> Vec<(PointId, usize)> {
         const RADIUS: f64 = 8.0;
-        let (width, height) = (self.rig.width, self.rig.height);
-        let (mut ids, mut expected) = (Vec::new(), Vec::new());
-        for id in points {
-            let point = &map.points[id];
-            let Some(at) = self.rig.project(&(T_cam_world * point.position)) else {
-                continue;
-            };
-            if (0.0..width as f64).contains(&at.u) && (0.0..height as f64).contains(&at.v) {
-                let at = Keypoint {
-                    u: at.u,
-                    v: at.v,
-                    scale: point.scale,
-                    sigma: point.scale,
-                };
-                ids.push(*id);
-                expected.push((point.descriptor, at));
-            }
-        }
         let features = &map.keyframes[keyframe].features;
-        let grid = Grid::new(&features.keypoints, width, height);
-        let pairs = match_projections(&expected, features, &grid, RADIUS, &self.config);
-        pairs.into_iter().map(|(i, f)| (ids[i], f)).collect()
+        let grid = Grid::new(&features.keypoints, self.rig.width, self.rig.height);
+        let features = (features, &grid);
+        find_points(
+            map,
+            points,
+            T_cam_world,
+            features,
+            RADIUS,
+            &self.rig,
+            &self.config,
+        )
+        .pairs
     }
 
     /// Solves the pose graph with the new loop in it, and moves key frames and points.

@@ -1,12 +1,13 @@
 //! Which features are of one thing: left to right along rows, and map to image.
 
 use barchan_datasets::Plane;
-use barchan_geometry::RectifiedRig;
+use barchan_geometry::{RectifiedRig, Se3};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Descriptor, Features};
+use crate::map::{Map, PointId};
 use crate::{Keypoint, SlamConfig};
 
 /// Differing bits of two descriptors.
@@ -214,9 +215,52 @@ fn refine_disparity([left, right]: [&Plane; 2], keypoint: &Keypoint, coarse: f64
     Some(u as f64 - at_right)
 }
 
+/// Map points and the features that may be them.
+pub(crate) struct ProjectedMatches {
+    pub pairs: Vec<(PointId, usize)>,
+    /// How many of the points should be in the image.
+    pub in_view: usize,
+}
+
+/// Features of an image, `radius` around where a pose puts map points, that look like them.
+#[allow(non_snake_case)]
+pub(crate) fn find_points(
+    map: &Map,
+    points: &[PointId],
+    T_cam_world: &Se3,
+    (features, grid): (&Features, &Grid),
+    radius: f64,
+    rig: &RectifiedRig,
+    config: &SlamConfig,
+) -> ProjectedMatches {
+    let (width, height) = (rig.width as f64, rig.height as f64);
+    let (mut ids, mut expected) = (Vec::new(), Vec::new());
+    for id in points {
+        let point = &map.points[id];
+        let Some(at) = rig.project(&(T_cam_world * point.position)) else {
+            continue;
+        };
+        if (0.0..width).contains(&at.u) && (0.0..height).contains(&at.v) {
+            let at = Keypoint {
+                u: at.u,
+                v: at.v,
+                scale: point.scale,
+                sigma: point.scale,
+            };
+            ids.push(*id);
+            expected.push((point.descriptor, at));
+        }
+    }
+    let pairs = match_projections(&expected, features, grid, radius, config);
+    ProjectedMatches {
+        pairs: pairs.into_iter().map(|(i, f)| (ids[i], f)).collect(),
+        in_view: ids.len(),
+    }
+}
+
 /// A feature of the image for each map point that is expected in it: `expected` gives descriptor,
 /// position and scale of point `i`. A feature takes the point that looks most like it.
-pub(crate) fn match_projections(
+fn match_projections(
     expected: &[(Descriptor, Keypoint)],
     features: &Features,
     grid: &Grid,

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::features::Descriptor;
 use crate::frame::Seen;
 use crate::map::{Map, PointId};
-use crate::matching::{match_all, match_projections};
+use crate::matching::{ProjectedMatches, find_points, match_all};
 use crate::pose::{Observation, optimise_pose, sample_pose};
 use crate::{Keypoint, SlamConfig};
 
@@ -222,30 +222,16 @@ impl Tracker {
         T_cam_world: &Se3,
         radius: f64,
     ) -> ProjectedMatches {
-        let (width, height) = (self.rig.width as f64, self.rig.height as f64);
-        let (mut ids, mut expected) = (Vec::new(), Vec::new());
-        for id in points {
-            let point = &map.points[id];
-            let Some(at) = self.rig.project(&(T_cam_world * point.position)) else {
-                continue;
-            };
-            if (0.0..width).contains(&at.u) && (0.0..height).contains(&at.v) {
-                let at = Keypoint {
-                    u: at.u,
-                    v: at.v,
-                    scale: point.scale,
-                    sigma: point.scale,
-                };
-                ids.push(*id);
-                expected.push((point.descriptor, at));
-            }
-        }
-        let [features, _] = &seen.features;
-        let pairs = match_projections(&expected, features, &seen.grid, radius, &self.config);
-        ProjectedMatches {
-            pairs: pairs.into_iter().map(|(i, f)| (ids[i], f)).collect(),
-            in_view: ids.len(),
-        }
+        let features = (&seen.features[0], &seen.grid);
+        find_points(
+            map,
+            points,
+            T_cam_world,
+            features,
+            radius,
+            &self.rig,
+            &self.config,
+        )
     }
 
     fn observations(&self, seen: &Seen, map: &Map, pairs: &[(PointId, usize)]) -> Vec<Observation> {
@@ -273,11 +259,4 @@ impl Tracker {
             self.config.disparity_sigma,
         )
     }
-}
-
-/// Map points and the features that may be them.
-struct ProjectedMatches {
-    pairs: Vec<(PointId, usize)>,
-    /// How many of the points should be in the image.
-    in_view: usize,
 }

@@ -16,8 +16,8 @@ const HEADER: usize = 227;
 const RECORD_HEADER: usize = 54;
 /// Bytes of a point of format 2: coordinates, intensity, flags, colour.
 const POINT: usize = 26;
-/// Points read at once.
-const CHUNK: usize = 65_536;
+/// Bytes of points read at once, about.
+const CHUNK: usize = 1 << 21;
 
 impl Cloud {
     /// Writes LAS 1.2, point format 2: coordinates to 0.1 mm, colour in 16 bits; compressed (LAZ) when
@@ -195,7 +195,7 @@ impl Cloud {
         };
         let mut points = vec![];
         while left > 0 {
-            let count = left.min(CHUNK as u64) as usize;
+            let count = left.min((CHUNK / size).max(1) as u64) as usize;
             let mut bytes = vec![0; count * size];
             match &mut source {
                 Points::Plain(file) => file.read_exact(&mut bytes).map_err(io)?,
