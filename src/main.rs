@@ -8,6 +8,7 @@ mod data;
 mod engine;
 mod output;
 mod preview;
+mod slam_run;
 
 use std::process::ExitCode;
 

@@ -1,26 +1,24 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{disparity_file, read_rgb};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
-use barchan_geometry::nalgebra::Matrix6;
-use barchan_geometry::{RectifiedRig, Rig, Se3, StampedPose, Trajectory};
+use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
-    CellStatistic, DenseKeyframe, Levelling, MapConfig, StereoErrors, elevation_of_keyframes,
-    map_keyframes,
+    CellStatistic, Levelling, MapConfig, StereoErrors, elevation_of_keyframes, map_keyframes,
 };
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
 
 use crate::commands::eval::read_trajectory;
 use crate::output::{Output, StagedDir};
+use crate::slam_run::{RunKeyframe, SlamRun};
 
 /// Turn a SLAM run into terrain: voxel cloud, DEM, hillshade, elevation with bounds
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan map runs/s --out map/\n  \
-    barchan map runs/s --voxel 0.02 --cell 0.05 --out map/
+    barchan map runs/s --voxel 0.02 --cell 0.05 --out map/\n  \
     barchan map runs/s --poses surveyed.tum --out map/     the run's disparity at somebody else's poses")]
 pub struct Args {
     /// A run of `barchan slam`
@@ -121,7 +119,8 @@ struct Summary {
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let (rig, keyframes) = open_run(&args.run, args.submap, args.poses.as_deref())?;
+    let slam = SlamRun::open(&args.run)?;
+    let keyframes = chosen(&slam, &args)?;
     let mut config = MapConfig {
         voxel: args.voxel,
         cell: args.cell,
@@ -153,13 +152,13 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     let frames = || {
         keyframes.iter().map(|k| {
             bar.inc(1);
-            k.read()
+            slam.read(k)
         })
     };
-    let mut map = map_keyframes(frames(), &rig, &config)?;
+    let mut map = map_keyframes(frames(), &slam.rig, &config)?;
     let elevation = elevation_of_keyframes(
         frames(),
-        &rig,
+        &slam.rig,
         &map.T_level_world,
         &config.limits,
         &errors,
@@ -170,7 +169,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         },
     )?;
     bar.finish_and_clear();
-    let pose_covariance = keyframes.iter().all(|k| k.pose_covariance.is_some());
+    let pose_covariance = keyframes.iter().all(|k| k.covariance.is_some());
     if !pose_covariance {
         map.notices.push(
             "the run has no covariance.csv: the bounds of elevation.tif hold what disparity may be off, and not what the poses may be off".into(),
@@ -267,170 +266,36 @@ fn read_places(file: &Path) -> Result<Trajectory> {
     Ok(Trajectory { poses })
 }
 
-/// Where the parts of a key frame lie.
-struct KeyframeFiles {
-    run: PathBuf,
-    name: String,
-    pose: StampedPose,
-    pose_covariance: Option<Matrix6<f64>>,
-}
-
-impl KeyframeFiles {
-    fn read(&self) -> Result<DenseKeyframe> {
-        let file = |folder: &str| {
-            self.run
-                .join("keyframes")
-                .join(folder)
-                .join(format!("{}.png", self.name))
-        };
-        Ok(DenseKeyframe {
-            time: self.pose.time,
-            T_world_cam: self.pose.T_world_cam,
-            pose_covariance: self.pose_covariance,
-            left: read_rgb(&file("left"))?,
-            disparity: disparity_file::read(&file("disparity"))?,
-            sigma: Some(disparity_file::read(&file("sigma"))?),
-        })
-    }
-}
-
-/// The rig and the key frames of a run: `keyframes.tum` has a line for every name, in order, in
-/// `keyframes/left`. `poses` replace those of the run; key frames they do not reach are left out.
-fn open_run(
-    run: &Path,
-    submap: Option<usize>,
-    poses: Option<&Path>,
-) -> Result<(RectifiedRig, Vec<KeyframeFiles>)> {
-    let trajectory = run.join("keyframes.tum");
-    if !trajectory.is_file() {
-        bail!(
-            "{}: no run of `barchan slam` (there is no keyframes.tum)\n  cure: `barchan slam --data DATA --out {0}` makes one",
-            run.display()
-        );
-    }
-    let rig_file = run.join("rig.toml");
-    let rig = Rig::load(&rig_file)?
-        .as_rectified()
-        .with_context(|| format!("{}: not rectified", rig_file.display()))?;
-    let estimated = Trajectory::read_tum(&trajectory)?.poses;
-    let folder = run.join("keyframes/disparity");
-    let entries = folder.read_dir().with_context(|| {
-        format!(
-            "{}: no disparity in this run\n  cure: run `barchan slam` with --model",
-            folder.display()
-        )
-    })?;
-    let mut names: Vec<String> = entries
-        .filter_map(|e| Some(e.ok()?.path().file_stem()?.to_str()?.to_owned()))
-        .collect();
-    names.sort();
-    if names.len() != estimated.len() {
-        bail!(
-            "{}: {} poses, but {} disparity images in {}",
-            trajectory.display(),
-            estimated.len(),
-            names.len(),
-            folder.display()
-        );
-    }
-    let parts = read_submaps(run, estimated.len())?;
-    let largest = || {
-        let count = |part: &usize| parts.iter().filter(|p| *p == part).count();
-        // Of equals the first.
-        (parts.iter().copied().rev()).max_by_key(count).unwrap_or(0)
-    };
-    let part = submap.unwrap_or_else(largest);
-    let others = poses
-        .map(|file| Trajectory::read_tum(file).map(|t| (file, t)))
-        .transpose()?;
-    let covariances = match &others {
-        None => read_covariances(run, estimated.len())?,
-        // Those of the run say nothing of somebody else's poses.
-        Some(_) => None,
-    };
-    let mut keyframes = vec![];
-    for (k, (name, mut pose)) in names.into_iter().zip(estimated).enumerate() {
-        // Poses from elsewhere say how the parts lie to each other.
-        if others.is_none() && parts[k] != part {
-            continue;
+/// Which of the run's key frames the map is made of, and where they are.
+fn chosen(run: &SlamRun, args: &Args) -> Result<Vec<RunKeyframe>> {
+    let Some(file) = &args.poses else {
+        let part = args.submap.unwrap_or_else(|| run.largest_part());
+        let keyframes = run.keyframes.iter().filter(|k| k.submap == part);
+        let keyframes: Vec<_> = keyframes.cloned().collect();
+        if keyframes.is_empty() {
+            bail!(
+                "{}: no key frame is of part {part} of the map\n  cure: see submap in keyframes.csv",
+                args.run.display()
+            );
         }
-        if let Some((_, others)) = &others {
-            match others.at(pose.time) {
-                Some(other) => pose.T_world_cam = other,
-                None => continue,
-            }
-        }
-        keyframes.push(KeyframeFiles {
-            run: run.to_owned(),
-            name,
-            pose,
-            pose_covariance: covariances.as_ref().map(|c| c[k]),
-        });
-    }
-    if others.is_none() && keyframes.is_empty() {
-        bail!(
-            "{}: no key frame is of part {part} of the map\n  cure: see submap in keyframes.csv",
-            run.display()
-        );
-    }
-    if let (Some((file, _)), true) = (&others, keyframes.is_empty()) {
+        return Ok(keyframes);
+    };
+    // Poses from elsewhere say how the parts lie to each other. The covariances of the run say nothing of
+    // them, and key frames that they do not reach are left out.
+    let others = Trajectory::read_tum(file)?;
+    let placed = run.keyframes.iter().filter_map(|k| {
+        let mut k = k.clone();
+        k.pose.T_world_cam = others.at(k.pose.time)?;
+        k.covariance = None;
+        Some(k)
+    });
+    let keyframes: Vec<_> = placed.collect();
+    if keyframes.is_empty() {
         bail!(
             "{}: none of its times is that of a key frame of {}\n  cure: give both the same clock",
             file.display(),
-            run.display()
+            args.run.display()
         );
     }
-    Ok((rig, keyframes))
-}
-
-/// The part of the map that each key frame belongs to: `keyframes.csv` of a run; all to one where
-/// there is none.
-fn read_submaps(run: &Path, keyframes: usize) -> Result<Vec<usize>> {
-    let file = run.join("keyframes.csv");
-    if !file.is_file() {
-        return Ok(vec![0; keyframes]);
-    }
-    let text = std::fs::read_to_string(&file).with_context(|| file.display().to_string())?;
-    let last_column = |line: &str| line.rsplit(',').next()?.trim().parse().ok();
-    let parts: Option<Vec<usize>> = text.lines().skip(1).map(last_column).collect();
-    match parts {
-        Some(parts) if parts.len() == keyframes => Ok(parts),
-        _ => bail!(
-            "{}: expected a line for each of {keyframes} key frames, with its submap last",
-            file.display()
-        ),
-    }
-}
-
-/// `covariance.csv` of a run, where there is one: a header, then a line for each key frame in order, the
-/// time and the 36 numbers of the covariance of (position, rotation vector) about the axes of the world.
-fn read_covariances(run: &Path, keyframes: usize) -> Result<Option<Vec<Matrix6<f64>>>> {
-    let file = run.join("covariance.csv");
-    if !file.is_file() {
-        return Ok(None);
-    }
-    let text = std::fs::read_to_string(&file).with_context(|| file.display().to_string())?;
-    let mut covariances = vec![];
-    for (number, line) in text.lines().enumerate().skip(1) {
-        let fields: Result<Vec<f64>, _> = line.split(',').map(|f| f.trim().parse()).collect();
-        let numbers = fields
-            .ok()
-            .filter(|f| f.len() == 37 && f.iter().all(|v| v.is_finite()));
-        let Some(numbers) = numbers else {
-            bail!(
-                "{}, line {}: expected a time and 36 numbers",
-                file.display(),
-                number + 1
-            );
-        };
-        covariances.push(Matrix6::from_row_slice(&numbers[1..]));
-    }
-    if covariances.len() != keyframes {
-        bail!(
-            "{}: {} lines for {keyframes} key frames",
-            file.display(),
-            covariances.len()
-        );
-    }
-    Ok(Some(covariances))
+    Ok(keyframes)
 }

@@ -1,75 +1,22 @@
 use std::collections::BTreeSet;
-use std::fmt::Write as _;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{Rgb, StereoSource, disparity_file, prefetch};
-use barchan_geometry::{RectifiedRig, Rig, Trajectory};
-use barchan_infer::DisparityMap;
+use barchan_datasets::{StereoSource, prefetch};
+use barchan_geometry::RectifiedRig;
 use barchan_slam::{
     Detector, LoopEvent, Map, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary,
 };
 use barchan_terrain::{Cloud, CloudPoint};
-use clap::Parser;
 use serde::Serialize;
 
+use super::Args;
 use crate::commands::features::FeatureKind;
-use crate::data::{Unchecked, open_checked};
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
-
-/// Track the camera through a sequence and gather dense key frames for `barchan map`
-#[derive(Parser)]
-#[command(after_help = "Examples:\n  \
-    barchan slam --data images/ --model a.onnx --out runs/s\n  \
-    barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
-    barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
-    barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday
-  \
-    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
-pub struct Args {
-    /// A stereo sequence: PATH or FORMAT:PATH
-    #[arg(long)]
-    data: String,
-    /// Disparity at key frames: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
-    /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
-    #[arg(long, default_value = "tiny")]
-    model: String,
-    /// The run directory that is written
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Disparity does not accept or refuse feature matches
-    #[arg(long)]
-    no_gate: bool,
-    /// Places seen before are not looked for: the trajectory drifts
-    #[arg(long)]
-    no_loops: bool,
-    /// Visual words to recognise places by, from `barchan vocabulary` or DBoW2, instead of the shipped
-    #[arg(long, value_name = "FILE")]
-    vocabulary: Option<PathBuf>,
-    /// Goes on in the map of an earlier run: its map.safetensors. The poses are then in that world
-    #[arg(long, value_name = "FILE")]
-    map: Option<PathBuf>,
-    /// All settings from a TOML file, as `config.toml` of an earlier run; flags win
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// What is followed from image to image (default orb)
-    #[arg(long, value_enum)]
-    features: Option<FeatureKind>,
-    /// Key points looked for in each image
-    #[arg(long, value_name = "COUNT")]
-    keypoints: Option<usize>,
-    /// A key frame is made when matches fall under this share
-    #[arg(long)]
-    keyframe_ratio: Option<f64>,
-    /// Threads of the disparity engine; 0 leaves it to the engine
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
-    #[command(flatten)]
-    unchecked: Unchecked,
-}
+use crate::slam_run::{RunKeyframe, write_dense, write_poses};
 
 #[derive(Serialize)]
 struct Summary {
@@ -88,22 +35,20 @@ struct Summary {
     matches: MatchCounts,
 }
 
-pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
-    let config = configuration(&args)?;
-    let source: Arc<dyn StereoSource> = open_checked(&args.data, &args.unchecked, output)?.into();
-    if (0..source.len()).any(|i| source.frame_rig(i) != source.rig()) {
-        bail!(
-            "{}: the pairs are of several rigs\n  cure: give one sequence of one rig",
-            args.data
-        );
-    }
+/// Features, a map of points, loops (`barchan_slam::Slam`) over a whole sequence.
+pub fn run(
+    args: &Args,
+    source: Arc<dyn StereoSource>,
+    out: StagedDir,
+    output: &Output,
+    runtime: Option<&Path>,
+) -> Result<()> {
+    let config = configuration(args)?;
     let words = (args.vocabulary.as_deref())
         .map(|path| vocabulary(path, config.detector))
         .transpose()?;
     let engine = load_engine(&args.model, runtime, args.threads)?;
-    let out = StagedDir::new(&args.out, "summary.json")?;
     out.write("config.toml", toml::to_string(&config)?)?;
-    out.write("rig.toml", Rig::from(*source.rig()).to_toml())?;
     let log = out.path("log.jsonl")?;
     let mut log = std::io::BufWriter::new(
         std::fs::File::create(&log).with_context(|| log.display().to_string())?,
@@ -130,7 +75,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             output.notice(&format!("frame {} is lost: {}", report.name, report.reason));
         }
         if let Some(dense) = report.dense.take() {
-            write_keyframe(&out, report.frame, &frame.left, &dense)?;
+            write_dense(&out, report.frame, &frame.left, &dense)?;
             disparity_ms.push(report.ms_disparity);
             matches.ratio += report.matches.ratio;
             matches.gate += report.matches.gate;
@@ -261,44 +206,17 @@ fn read_map(file: &Path, rig: &RectifiedRig, detector: Detector) -> Result<Map> 
     Ok(map)
 }
 
-/// Files that sort as their key frames follow each other.
-fn write_keyframe(out: &StagedDir, frame: usize, left: &Rgb, dense: &DisparityMap) -> Result<()> {
-    let path = |folder: &str| out.path(format!("keyframes/{folder}/{frame:06}.png"));
-    disparity_file::write_png(&path("disparity")?, &dense.disparity)?;
-    disparity_file::write_png(&path("sigma")?, &dense.sigma)?;
-    let file = path("left")?;
-    image::DynamicImage::from(left.clone())
-        .to_rgb8()
-        .save(&file)
-        .with_context(|| file.display().to_string())
-}
-
 fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
-    out.write("trajectory.tum", result.trajectory.to_tum())?;
-    out.write("trajectory.kitti", result.trajectory.to_kitti())?;
-    let keyframes = Trajectory {
-        poses: result.keyframes.iter().map(|(_, _, pose)| *pose).collect(),
-    };
-    out.write("keyframes.tum", keyframes.to_tum())?;
-    let mut table = String::from("frame,name,time,submap\n");
-    for ((frame, name, pose), submap) in result.keyframes.iter().zip(&result.submaps) {
-        writeln!(table, "{frame},{name},{},{submap}", pose.time)?;
-    }
-    out.write("keyframes.csv", table)?;
-    if let Some(covariances) = &result.covariances {
-        let mut table = String::from("time");
-        for (row, column) in (0..36).map(|k| (k / 6, k % 6)) {
-            write!(table, ",c{row}{column}")?;
-        }
-        for ((_, _, pose), covariance) in result.keyframes.iter().zip(covariances) {
-            write!(table, "\n{}", pose.time)?;
-            // Symmetric: rows are columns.
-            covariance
-                .iter()
-                .try_for_each(|c| write!(table, ",{c:e}"))?;
-        }
-        out.write("covariance.csv", table + "\n")?;
-    }
+    let keyframes: Vec<_> = (result.keyframes.iter().zip(&result.submaps).enumerate())
+        .map(|(k, ((frame, name, pose), submap))| RunKeyframe {
+            frame: *frame,
+            name: name.clone(),
+            pose: *pose,
+            submap: *submap,
+            covariance: result.covariances.as_ref().map(|c| c[k]),
+        })
+        .collect();
+    write_poses(out, &result.trajectory, &keyframes)?;
     let point = |p: &barchan_slam::MapPoint| CloudPoint {
         position: p.position,
         colour: p.colour,
