@@ -3,7 +3,10 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use barchan_infer::{BlockMatching, BurnEngine, DisparityEngine, OnnxEngine, Runtime, SemiGlobal};
+use barchan_infer::{
+    BlockMatching, BurnEngine, Contract, DisparityEngine, OnnxEngine, Outlined, Outlines, Runtime,
+    SemiGlobal,
+};
 use barchan_model::{Device, StereoNet, onnx, weights};
 use barchan_train::RunDir;
 
@@ -12,6 +15,18 @@ const SHIPPED: [(&str, &[u8]); 2] = [
     ("rover", include_bytes!("../checkpoints/rover.safetensors")),
     ("tiny", include_bytes!("../checkpoints/tiny.safetensors")),
 ];
+
+/// How engines run; flags that all commands with `--model` share.
+#[derive(Clone, Copy, Debug, clap::Args)]
+pub struct EngineSettings {
+    /// Threads that work on one image; 0 leaves it to the engine
+    #[arg(long, default_value_t = 0)]
+    pub threads: usize,
+    /// How often the outlines of a network's disparity are moved to where the images have them; each time
+    /// by up to nine pixels. 0 leaves the network's answer as it is
+    #[arg(long, default_value_t = Outlines::default().passes, value_name = "PASSES")]
+    pub outlines: usize,
+}
 
 /// The network of a shipped name, a safetensors file, or a run directory of `barchan train`; with
 /// `:192` after it, searching 192 disparities.
@@ -45,20 +60,32 @@ pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {
 /// The engine for a model: ONNX Runtime for `x.onnx`, and for shipped names where it is installed, which is
 /// several times as fast; Burn for weights, and for shipped names elsewhere; `sgm` and `bm` without any
 /// network; `rover:192` and `sgm:192` search 192 disparities.
+///
+/// Outlines of our own networks are sharpened; other people's and the classical matchers' are theirs.
 pub fn load_engine(
     model: &str,
     runtime: Option<&Path>,
-    threads: usize,
+    settings: &EngineSettings,
 ) -> Result<Box<dyn DisparityEngine>> {
     if let Some(engine) = classical(model)? {
         return Ok(engine);
     }
+    let threads = settings.threads;
+    let outlined = |engine: Box<dyn DisparityEngine>| -> Box<dyn DisparityEngine> {
+        match settings.outlines {
+            0 => engine,
+            passes => Box::new(Outlined::new(engine, Outlines { passes })),
+        }
+    };
     let path = Path::new(model);
     if path.extension().is_some_and(|e| e == "onnx") {
         // A missing file is the more likely mistake, and the cheaper to find.
         std::fs::metadata(path).with_context(|| format!("{model}: no such model"))?;
         let runtime = Runtime::load(runtime)?;
-        return Ok(Box::new(OnnxEngine::load(&runtime, path, threads)?));
+        let engine = OnnxEngine::load(&runtime, path, threads)?;
+        let own = *engine.contract() == Contract::own();
+        let engine = Box::new(engine);
+        return Ok(if own { outlined(engine) } else { engine });
     }
     let device = Device::flex();
     let net = load_net(model, &device)?;
@@ -68,11 +95,10 @@ pub fn load_engine(
     if shipped && (runtime.is_some() || Runtime::find(None).is_ok()) {
         let runtime = Runtime::load(runtime)?;
         let bytes = onnx::to_bytes(&net);
-        return Ok(Box::new(OnnxEngine::of_export(
-            &runtime, bytes, model, threads,
-        )?));
+        let engine = OnnxEngine::of_export(&runtime, bytes, model, threads)?;
+        return Ok(outlined(Box::new(engine)));
     }
-    Ok(Box::new(BurnEngine::new(net, device, model)))
+    Ok(outlined(Box::new(BurnEngine::new(net, device, model))))
 }
 
 /// The matcher without a network that `model` names, if it does.

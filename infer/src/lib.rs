@@ -2,7 +2,8 @@
 //!
 //! What it is for: [`DisparityEngine`], the one trait through which SLAM, mapping and the command
 //! line see disparity, whoever makes it; [`SemiGlobal`] and [`BlockMatching`], which need no model;
-//! [`Rejection`], which marks as unknown what the pair itself contradicts. Engines stand behind
+//! [`Outlines`], which puts the outlines of a
+//! network's disparity where the images have them; [`Rejection`], which marks as unknown what the pair itself contradicts. Engines stand behind
 //! features: `burn`, `onnxruntime`. With the latter, `probe` finds out what somebody else's ONNX file
 //! wants and means, a `Contract` (`x.toml` beside `x.onnx`) keeps it for `OnnxEngine`, and `quantize`
 //! makes an int8 network out of a float one.
@@ -17,6 +18,7 @@ mod classical;
 mod engine;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
+mod outlines;
 #[cfg(feature = "onnxruntime")]
 mod probe;
 #[cfg(feature = "onnxruntime")]
@@ -32,6 +34,7 @@ pub use onnxruntime::{
     Channels, Contract, ImageFormat, InputFormat, Layout, ModelSize, OnnxEngine, OutputFormat,
     OutputLayout, Runtime, Side, Unit,
 };
+pub use outlines::{Outlined, Outlines};
 #[cfg(feature = "onnxruntime")]
 pub use probe::{Decision, Verdict, probe};
 #[cfg(feature = "onnxruntime")]

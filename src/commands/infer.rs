@@ -13,7 +13,7 @@ use clap::Parser;
 use serde::Serialize;
 
 use crate::data::{Unchecked, open_checked};
-use crate::engine::load_engine;
+use crate::engine::{EngineSettings, load_engine};
 use crate::output::{Output, StagedDir, percentiles};
 use crate::preview::{disparity_beside_image, disparity_range};
 
@@ -51,9 +51,8 @@ pub struct Args {
     /// Largest accepted structural dissimilarity (1 - SSIM) / 2 of the warped pair
     #[arg(long, default_value_t = Rejection::default().max_dissimilarity)]
     reject: f32,
-    /// Threads that work on one image; 0 leaves it to the engine
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
+    #[command(flatten)]
+    engine: EngineSettings,
     #[command(flatten)]
     unchecked: Unchecked,
 }
@@ -69,7 +68,7 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let frames = open_frames(&args, output)?;
-    let mut engine = load_engine(&args.model, runtime, args.threads)?;
+    let mut engine = load_engine(&args.model, runtime, &args.engine)?;
     let out = StagedDir::new(&args.out, "summary.json")?;
     let rejection = (!args.no_reject).then_some(Rejection {
         max_dissimilarity: args.reject,
@@ -104,6 +103,10 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             &map.confidence,
             &out.path(format!("confidence/{name}.png"))?,
         )?;
+        // The full precision, for those who rank pixels by it.
+        for (what, plane) in [("confidence", &map.confidence), ("sigma", &map.sigma)] {
+            disparity_file::write_pfm(&out.path(format!("{what}/{name}.pfm"))?, plane)?;
+        }
         // Colours of the first frame hold for all, so that frames compare.
         let range = *colours.get_or_insert_with(|| disparity_range(&map.disparity));
         let preview = out.path(format!("preview/{name}.png"))?;
@@ -137,7 +140,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     out.write_json("summary.json", &summary)?;
     out.finish()?;
     let text = format!(
-        "{frames} frames with {}: {ms_median:.1} ms median, {ms_p95:.1} ms p95; {:.1} % of the pixels kept\n{}: disparity/ confidence/ preview/{}",
+        "{frames} frames with {}: {ms_median:.1} ms median, {ms_p95:.1} ms p95; {:.1} % of the pixels kept\n{}: disparity/ confidence/ sigma/ preview/{}",
         summary.engine,
         100.0 * summary.density,
         args.out.display(),

@@ -70,6 +70,8 @@ fn train_export_and_compare(device: &str, steps: usize) {
             "--model",
             model,
             "--no-reject",
+            "--outlines",
+            "0",
             "--out",
             text(&out),
         ]);

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnxruntime
 
-from common import Barchan, Table, read_pfm, read_rgb
+from common import Barchan, Table, read_pfm
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -48,10 +47,12 @@ def main() -> None:
     barchan, shared = Barchan(options.barchan), ROOT.parent / "shared" / "data"
     options.work.mkdir(parents=True, exist_ok=True)
 
-    def network(reach: int) -> onnxruntime.InferenceSession:
-        model = options.work / f"{reach}.onnx"
-        barchan("export", f"{options.model}:{reach}", "--out", model)
-        return onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    def network(reach: int, images: list) -> tuple:
+        """Disparity, sigma, confidence, as the program answers."""
+        out = options.work / "answer"
+        left, right = images
+        barchan("infer", "--left", left, "--right", right, "--model", f"{options.model}:{reach}", "--no-reject", "--out", out)
+        return tuple(read_pfm(out / what / f"{left.stem}.pfm") for what in ("disparity", "sigma", "confidence"))
 
     def photographs(table: Table) -> None:
         for name, (folder, left, right, truth, reach, target) in PHOTOGRAPHS.items():
@@ -59,7 +60,7 @@ def main() -> None:
                 continue
             images = [shared / folder / image for image in (left, right)]
             true = np.abs(read_pfm(shared / folder / truth))
-            disparity, _, confidence = run(network(reach), images)
+            disparity, _, confidence = network(reach, images)
             own, filled = sgbm(images, reach)
             error = np.abs(disparity - true)
             table.at_most(f"{name}: bad2 at full density, % (SGBM filled {share(filled, true):.1f})", share(disparity, true), target)
@@ -75,7 +76,7 @@ def main() -> None:
             outlines(name, disparity, true)
 
     def rendered(table: Table) -> None:
-        session, everything = network(96), []
+        everything = []
         for kind, spec in RENDERED.items():
             ours, theirs = [], []
             for seed in range(SEEDS):
@@ -87,7 +88,7 @@ def main() -> None:
                 true = cv2.imread(str(data / "disparity" / left.name), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
                 # What lies beyond the range nobody was asked to find.
                 known = (true > 0) & (true < 94)
-                disparity, sigma, confidence = run(session, images)
+                disparity, sigma, confidence = network(96, images)
                 ours.append((disparity - true)[known])
                 theirs.append((sgbm(images, 96)[1] - true)[known])
                 everything.append((np.abs(disparity - true)[known], sigma[known], confidence[known]))
@@ -102,13 +103,6 @@ def main() -> None:
         table.at_most("the same by sigma", sparsification(error, sigma), 1.5)
 
     Table().run([photographs, rendered])
-
-
-def run(session: onnxruntime.InferenceSession, images: list) -> tuple:
-    """Disparity, sigma, confidence."""
-    left, right = (read_rgb(image).transpose(2, 0, 1)[None] for image in images)
-    outputs = session.run(["disparity", "sigma", "confidence"], {"left": left, "right": right})
-    return tuple(x[0, 0] for x in outputs)
 
 
 def sgbm(images: list, reach: int) -> tuple:

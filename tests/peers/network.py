@@ -41,7 +41,8 @@ def check_disparity(
             ("Burn", weights, 1e-3, 1e-2),
         ]:
             out = work / f"{name}-{file.suffix[1:]}"
-            barchan("infer", "--data", f"folder:{folder}", "--model", file, "--no-reject", "--out", out)
+            barchan("infer", "--data", f"folder:{folder}", "--model", file, "--no-reject",
+                    "--outlines", 0, "--out", out)
             difference = np.concatenate(
                 [np.abs(read_pfm(out / "disparity" / f"{stem}.pfm") - d).ravel() for stem, d in truth.items()]
             )

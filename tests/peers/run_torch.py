@@ -68,7 +68,8 @@ def check_outputs(table: Table, barchan: Barchan, label: str, weights: Path, fol
     difference = {what: [] for what in ("barchan infer: disparity, px", *names)}
     for folder in folders:
         out = work / f"{model.stem}-{folder.name}"
-        barchan("infer", "--data", f"folder:{folder}", "--model", weights, "--no-reject", "--no-check", "--out", out)
+        barchan("infer", "--data", f"folder:{folder}", "--model", weights, "--no-reject", "--no-check",
+                "--outlines", 0, "--out", out)
         for stem, (left, right) in pairs(folder).items():
             with torch.no_grad():
                 truth = [x[0, 0].numpy() for x in net(left, right)]

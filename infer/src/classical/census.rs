@@ -8,14 +8,14 @@ use rayon::prelude::*;
 
 /// A census transform: a bit for each neighbour in a window of 9 x 7, set where it is darker than
 /// the pixel.
-pub(super) struct Census {
+pub(crate) struct Census {
     pub width: usize,
     pub height: usize,
-    bits: Vec<u64>,
+    pub bits: Vec<u64>,
 }
 
 /// Most bits that differ between two transforms.
-pub(super) const MOST: u8 = 62;
+pub(crate) const MOST: u8 = 62;
 
 /// The cost of what lies outside the right image: that of a fair match, so that paths carry on with
 /// what they know from inside rather than turn to a chance likeness.
@@ -26,7 +26,7 @@ const RADIUS_X: usize = 4;
 const RADIUS_Y: usize = 3;
 
 /// The transform of a grey image; beyond the border its last pixels repeat.
-pub(super) fn census(image: &Plane) -> Census {
+pub(crate) fn census(image: &Plane) -> Census {
     let (width, height) = (image.width() as usize, image.height() as usize);
     // Sixteen bits: finer than any camera, and half the work of floats.
     let stride = width + 2 * RADIUS_X;

@@ -6,13 +6,13 @@ mod finish;
 mod semi_global;
 
 pub use block_matching::BlockMatching;
+pub(crate) use census::{Census, MOST as MOST_DIFFERENT, census};
 pub use semi_global::SemiGlobal;
 
 use std::ops::Range;
 
 use barchan_datasets::{Rgb, luma};
 
-use census::{Census, census};
 use finish::{Pixel, clean};
 
 use crate::DisparityMap;

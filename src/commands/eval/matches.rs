@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
-use crate::engine::load_engine;
+use crate::engine::{EngineSettings, load_engine};
 use crate::output::{Output, StagedDir};
 use crate::preview::matches_over_pair;
 
@@ -62,9 +62,8 @@ pub struct Args {
     /// alone, yellow by looks where disparity is not known, red by looks against disparity
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Threads of the disparity engine; 0 leaves it to the engine
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
+    #[command(flatten)]
+    engine: EngineSettings,
     #[command(flatten)]
     unchecked: Unchecked,
 }
@@ -100,7 +99,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         (given, _) => given.to_vec(),
     };
     let source = open_checked(&args.data, &args.unchecked, output)?;
-    let mut engine = load_engine(&args.model, runtime, args.threads)?;
+    let mut engine = load_engine(&args.model, runtime, &args.engine)?;
     let out = (args.out.as_deref())
         .map(|out| StagedDir::new(out, "matches.json"))
         .transpose()?;

@@ -12,6 +12,7 @@ use clap::{Parser, ValueEnum};
 
 use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
+use crate::engine::EngineSettings;
 use crate::output::{Output, StagedDir};
 
 /// Track the camera through a sequence and gather dense key frames for `barchan map`
@@ -60,9 +61,8 @@ pub struct Args {
     /// A key frame is made when matches fall under this share
     #[arg(long)]
     keyframe_ratio: Option<f64>,
-    /// Threads of the disparity engine; 0 leaves it to the engine
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
+    #[command(flatten)]
+    engine: EngineSettings,
     #[command(flatten)]
     unchecked: Unchecked,
 }

@@ -47,7 +47,7 @@ pub fn run(
     let words = (args.vocabulary.as_deref())
         .map(|path| vocabulary(path, config.detector))
         .transpose()?;
-    let engine = load_engine(&args.model, runtime, args.threads)?;
+    let engine = load_engine(&args.model, runtime, &args.engine)?;
     out.write("config.toml", toml::to_string(&config)?)?;
     let log = out.path("log.jsonl")?;
     let mut log = std::io::BufWriter::new(
