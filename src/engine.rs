@@ -23,7 +23,7 @@ pub struct EngineSettings {
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
     /// How often the outlines of a network's disparity are moved to where the images have them; each time
-    /// by up to nine pixels. 0 leaves the network's answer as it is
+    /// by up to ten pixels. 0 leaves the network's answer as it is
     #[arg(long, default_value_t = Outlines::default().passes, value_name = "PASSES")]
     pub outlines: usize,
 }

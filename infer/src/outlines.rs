@@ -12,25 +12,25 @@ use crate::engine::{DisparityEngine, DisparityMap, InferError};
 /// Puts outlines where the images have them: a matching window that reaches over an outline fattens the
 /// nearer surface, and what works at a quarter of the resolution draws outlines as coarsely.
 ///
-/// Every pixel may take over the surface of a pixel up to nine away, disparity and slope, if full-resolution
+/// Every pixel may take over the surface of a pixel up to ten away, disparity and slope, if full-resolution
 /// likeness (census, weighed by colour around the pixel) and the neighbours' choices, along four
 /// paths, agree: semi-global matching (Hirschmüller 2008) among few planes, proposed as in PatchMatch stereo
 /// (Bleyer 2011). What nearer surfaces hide from the right camera is no match at all, and costs as much
 /// whatever it is taken for.
 #[derive(Clone, Copy, Debug)]
 pub struct Outlines {
-    /// How often: each pass moves outlines by up to nine pixels.
+    /// How often: each pass moves outlines by up to ten pixels.
     pub passes: usize,
 }
 
 impl Default for Outlines {
     fn default() -> Self {
-        Self { passes: 3 }
+        Self { passes: 2 }
     }
 }
 
 /// Distances along an axis at which surfaces are proposed, pixels.
-const REACH: [isize; 3] = [-9, 0, 9];
+const REACH: [isize; 5] = [-10, -5, 0, 5, 10];
 /// Proposals closer than this to one there is are the same, pixels.
 const SAME: f32 = 1.0;
 /// Most surfaces that a pixel chooses from.
