@@ -550,3 +550,45 @@ fn merged(map: &VoxelMap) -> Cloud {
         points: map.voxels(1).iter().map(Voxel::to_point).collect(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_weighted_median_has_half_the_weight_on_either_side() {
+        let of = |pairs: &[(f64, f64)]| {
+            let witness = |(factor, weight): &(f64, f64)| Witness {
+                factor: *factor,
+                weight: *weight,
+            };
+            weighted_median(pairs.iter().map(witness).collect())
+        };
+        assert_eq!(of(&[]), None);
+        assert_eq!(of(&[(5.0, 0.0)]), None);
+        assert_eq!(of(&[(5.0, 1.0), (1.0, 1.0), (3.0, 1.0)]), Some(3.0));
+        assert_eq!(of(&[(5.0, 3.0), (1.0, 1.0), (3.0, 1.0)]), Some(5.0));
+        // An outlier however far moves nothing.
+        assert_eq!(of(&[(1e9, 1.0), (1.0, 1.0), (1.1, 1.0)]), Some(1.1));
+    }
+
+    #[test]
+    fn the_baseline_gives_the_factor_of_poses_without_noise_and_outliers_go() {
+        let at = |time: f64, x: f64| StampedPose {
+            time,
+            T_world_cam: Se3::translation(x, 0.0, time),
+        };
+        let left = Trajectory {
+            poses: (0..40).map(|i| at(f64::from(i), 0.0)).collect(),
+        };
+        let mut right = Trajectory {
+            poses: (0..40).map(|i| at(f64::from(i), 0.3)).collect(),
+        };
+        let factor = |right: &Trajectory| baseline_factor(&left, right, 0.12);
+        assert!((factor(&right).unwrap() - 0.4).abs() < 1e-12);
+        right.poses[7] = at(7.0, 20.0);
+        assert!((factor(&right).unwrap() - 0.4).abs() < 1e-12);
+        assert_eq!(factor(&Trajectory::default()), None);
+        assert_eq!(factor(&left), None, "cameras at one place");
+    }
+}

@@ -1,13 +1,14 @@
 //! Odometry by registration of clouds (de Jong 2020, chapter 5): a cloud for each pair, brought onto an earlier
 //! one, motions chained, clouds merged.
 //!
-//! Nothing here corrects an error once made. It is the thesis's baseline, with what it says was missing: planes
+//! Nothing here corrects an error once made, and on even ground nothing tells of one: seen from a rover, ground looks
+//! the same a few metres on, and a cloud brought to the wrong place there fits as well. It is the thesis's baseline, with what it says was missing: planes
 //! instead of points, a start at constant velocity, and a word about each frame that went wrong.
 
 use std::time::Instant;
 
 use barchan_datasets::StereoFrame;
-use barchan_geometry::registration::{IcpConfig, Reference, Registration, register};
+use barchan_geometry::registration::{IcpConfig, IcpMethod, Reference, Registration, register};
 use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory, se3};
 use barchan_infer::{DisparityEngine, DisparityMap};
 use barchan_terrain::{Cloud, Voxel, VoxelMap};
@@ -33,7 +34,8 @@ pub struct IcpOdometryConfig {
     pub keyframe_angle_deg: f64,
     /// Edge of the cubes that the map is merged in, metres. Default 0.02.
     pub merge_grid: f64,
-    /// How clouds are registered. Default points with planes, at most 0.3 m apart.
+    /// How clouds are registered. Default planes with planes, at most 0.3 m apart: clouds of stereo are noisy on
+    /// both sides.
     pub registration: IcpConfig,
     /// How a pair becomes a cloud.
     pub cloud: StereoCloudConfig,
@@ -48,7 +50,9 @@ impl Default for IcpOdometryConfig {
             keyframe_angle_deg: 5.0,
             merge_grid: 0.02,
             registration: IcpConfig {
+                method: IcpMethod::Generalised,
                 max_distance: 0.3,
+                iterations: 30,
                 tolerance: 1e-4,
                 ..IcpConfig::default()
             },

@@ -85,7 +85,7 @@ pub struct Args {
 
 /// How the camera is followed.
 #[derive(Clone, Copy, ValueEnum)]
-enum Method {
+pub enum Method {
     /// Features in both images, a map of points, loops
     Stereo,
     /// The cloud of each pair brought onto that of the pair before (de Jong 2020, chapter 5)
