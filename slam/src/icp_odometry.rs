@@ -24,8 +24,12 @@ use crate::stereo_cloud::{StereoCloudConfig, StereoClouds, box_filtered};
 pub struct IcpOdometryConfig {
     /// Edge of the cubes that clouds are thinned to before registration, metres. Default 0.05; the thesis 0.1.
     pub grid: f64,
-    /// Least share of a cloud that must correspond to that of the last key frame. Default 0.5.
+    /// Least share of a cloud that must correspond to that of the last key frame. Default 0.85.
     pub min_fitness: f64,
+    /// Farthest that registration may lead from where constant velocity puts a frame, metres. Default 0.5.
+    pub max_jump: f64,
+    /// The same of rotation, degrees. Default 15.
+    pub max_jump_deg: f64,
     /// Metres of motion after which a frame is a key frame: the next ones are brought onto it, and its cloud is
     /// merged. Default 0.2. 0 is the thesis's chain from each frame to the next: errors add up the faster, and the noise
     /// of stereo, which stays where it is in the image, makes motions come out too short.
@@ -45,7 +49,9 @@ impl Default for IcpOdometryConfig {
     fn default() -> Self {
         Self {
             grid: 0.05,
-            min_fitness: 0.5,
+            min_fitness: 0.85,
+            max_jump: 0.5,
+            max_jump_deg: 15.0,
             keyframe_distance: 0.2,
             keyframe_angle_deg: 5.0,
             merge_grid: 0.02,
@@ -177,22 +183,16 @@ impl IcpOdometry {
 
         let mut T_world_cam = self.predict(frame.time);
         if let Some((cloud, T_world_ref)) = &self.reference {
-            let how = &self.config.registration;
-            match register(&points, cloud, &T_world_ref.inv_mul(&T_world_cam), how) {
-                Ok(found) if found.overlap >= self.config.min_fitness => {
-                    report.take(&found);
-                    T_world_cam = T_world_ref * found.T_ref_est;
-                    // Poses that start from each other let an error of the norm grow without bound.
-                    T_world_cam.rotation.renormalize();
-                }
+            let T_start = T_world_ref.inv_mul(&T_world_cam);
+            match register(&points, cloud, &T_start, &self.config.registration) {
                 Ok(found) => {
                     report.take(&found);
-                    report.reason = format!(
-                        "{:.0} % of its points lie within {} m of the last key frame's, and {:.0} % are asked for",
-                        100.0 * found.overlap,
-                        how.max_distance,
-                        100.0 * self.config.min_fitness
-                    );
+                    report.reason = self.doubt(&found, &T_start);
+                    if report.reason.is_empty() {
+                        T_world_cam = T_world_ref * found.T_ref_est;
+                        // Poses that start from each other let an error of the norm grow without bound.
+                        T_world_cam.rotation.renormalize();
+                    }
                 }
                 Err(why) => report.reason = why.to_string(),
             }
@@ -250,6 +250,37 @@ impl IcpOdometry {
                 last.T_world_cam * se3::exp(&(twist * share))
             }
             _ => last.T_world_cam,
+        }
+    }
+
+    /// Why a registration is not believed; empty when it is.
+    #[allow(non_snake_case)]
+    fn doubt(&self, found: &Registration, T_start: &Se3) -> String {
+        let IcpOdometryConfig {
+            min_fitness,
+            max_jump,
+            max_jump_deg,
+            registration,
+            ..
+        } = &self.config;
+        let jump = T_start.inv_mul(&found.T_ref_est);
+        let (far, angle) = (
+            jump.translation.vector.norm(),
+            jump.rotation.angle().to_degrees(),
+        );
+        if found.overlap < *min_fitness {
+            format!(
+                "{:.0} % of its points lie within {} m of the last key frame's, and {:.0} % are asked for",
+                100.0 * found.overlap,
+                registration.max_distance,
+                100.0 * min_fitness
+            )
+        } else if far > *max_jump || angle > *max_jump_deg {
+            format!(
+                "registration leads {far:.2} m and {angle:.0} degrees away from where constant velocity puts it, and {max_jump} m and {max_jump_deg} degrees are allowed"
+            )
+        } else {
+            String::new()
         }
     }
 

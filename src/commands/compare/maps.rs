@@ -2,7 +2,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use anyhow::Result;
-use barchan_datasets::StereoSource;
+use barchan_datasets::{Plane, StereoSource};
 use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::nalgebra::Point3;
 use barchan_geometry::{Se3, StampedPose, Trajectory};
@@ -180,13 +180,16 @@ fn true_keyframe(
         return Ok(None);
     };
     let frame = source.frame(index)?;
+    // Nothing is surer: as far out as any engine claims to see.
+    let (width, height) = disparity.dimensions();
+    let sigma = Plane::new(width, height);
     Ok(truth.at(frame.time).map(|pose| DenseKeyframe {
         time: frame.time,
         T_world_cam: pose,
         pose_covariance: None,
         left: frame.left,
         disparity,
-        sigma: None,
+        sigma: Some(sigma),
     }))
 }
 

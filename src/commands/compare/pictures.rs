@@ -55,9 +55,13 @@ pub fn maps(
     });
     let all: Vec<_> = of_truth.into_iter().chain(of_runs).collect();
     // What is known for sure says where to look; a run that went astray would make the rest small.
-    let Some(view) = all.first().map(|(_, map, _)| View::of(map)) else {
+    let Some((_, map, route)) = all.first() else {
         return Ok(());
     };
+    let view = View::of(
+        map,
+        route.copied().or(true_route.as_ref()).map_or(&[], |r| r),
+    );
     let mut tiles = vec![];
     for (name, map, route) in all {
         let mut picture = view.ground(map);
@@ -93,19 +97,25 @@ impl View {
     /// Pixels of the longer side.
     const SIDE: f64 = 640.0;
 
-    /// The extent of a map, and a little around it.
-    fn of(map: &TerrainMap) -> Self {
+    /// The extent of a map and of a route, and a little around them.
+    fn of(map: &TerrainMap, route: &[(f64, f64)]) -> Self {
         let grid = &map.dem.raster.grid;
-        let (wide, high) = (
-            grid.width as f64 * grid.cell_x,
-            grid.height as f64 * grid.cell_y,
+        let mut west_north = (grid.west, grid.north);
+        let mut east_south = (
+            grid.west + grid.width as f64 * grid.cell_x,
+            grid.north - grid.height as f64 * grid.cell_y,
         );
-        let around = 0.05 * wide.max(high);
+        for (x, y) in route {
+            west_north = (west_north.0.min(*x), west_north.1.max(*y));
+            east_south = (east_south.0.max(*x), east_south.1.min(*y));
+        }
+        let (wide, high) = (east_south.0 - west_north.0, west_north.1 - east_south.1);
+        let around = 0.03 * wide.max(high);
         let pixel = (wide.max(high) + 2.0 * around) / Self::SIDE;
         let pixels = |length: f64| ((length + 2.0 * around) / pixel).round().max(1.0) as u32;
         Self {
-            west: grid.west - around,
-            north: grid.north + around,
+            west: west_north.0 - around,
+            north: west_north.1 + around,
             pixel,
             width: pixels(wide),
             height: pixels(high),
