@@ -81,7 +81,7 @@ fn what_cannot_be_placed_is_said_and_what_follows_goes_on() {
     );
     // What sees nothing is passed over; what sees something else begins a part of its own.
     assert!(!reports[2].keyframe && reports[4].keyframe && reports[5].keyframe);
-    assert_eq!(result.submaps, [0, 1, 2]);
+    assert_eq!(result.submaps, [0, 0, 1, 2]);
     assert_eq!(result.trajectory.poses.len(), 6);
 }
 

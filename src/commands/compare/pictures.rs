@@ -58,10 +58,8 @@ pub fn maps(
     let Some((_, map, route)) = all.first() else {
         return Ok(());
     };
-    let view = View::of(
-        map,
-        route.copied().or(true_route.as_ref()).map_or(&[], |r| r),
-    );
+    let route = route.or(true_route.as_ref());
+    let view = View::of(map, route.map_or(&[], |r| r.as_slice()));
     let mut tiles = vec![];
     for (name, map, route) in all {
         let mut picture = view.ground(map);
