@@ -26,7 +26,7 @@ pub fn outliers(points: &[Point3<f64>], neighbours: usize, deviations: f64) -> V
     let mean = known().sum::<f64>() / n;
     let variance = known().map(|d| (d - mean).powi(2)).sum::<f64>() / n;
     let most = mean + deviations * variance.sqrt();
-    distances.iter().map(|d| !(*d <= most)).collect()
+    distances.iter().map(|d| d.is_nan() || *d > most).collect()
 }
 
 #[cfg(test)]
