@@ -50,6 +50,7 @@ enum Command {
     Raster(commands::raster::Args),
     Report(commands::report::Args),
     Eval(commands::eval::Args),
+    Compare(commands::compare::Args),
     Data(commands::data::Args),
     Vocabulary(commands::vocabulary::Args),
     Doctor(commands::doctor::Args),
@@ -59,7 +60,10 @@ enum Command {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    let output = output::Output { json: cli.json };
+    let output = output::Output {
+        json: cli.json,
+        quiet: false,
+    };
     let runtime = cli.onnxruntime.as_deref();
     let result = match cli.command {
         Command::Demo(args) => commands::demo::run(args, &output, runtime),
@@ -77,6 +81,7 @@ fn main() -> ExitCode {
         Command::Raster(args) => commands::raster::run(args, &output),
         Command::Report(args) => commands::report::run(args, &output),
         Command::Eval(args) => commands::eval::run(args, &output, runtime),
+        Command::Compare(args) => commands::compare::run(args, &output, runtime),
         Command::Data(args) => match commands::data::run(args, &output) {
             // A check that found something is no error, and scripts want to know.
             Ok(false) => return ExitCode::from(1),

@@ -11,11 +11,24 @@ use serde::Serialize;
 pub struct Output {
     /// JSON on standard output, and nothing else there.
     pub json: bool,
+    /// No result on standard output: the command is a part of another.
+    pub quiet: bool,
 }
 
 impl Output {
+    /// For a command that is a part of another, whose result is not to be printed.
+    pub fn quiet(&self) -> Self {
+        Self {
+            json: self.json,
+            quiet: true,
+        }
+    }
+
     /// Prints the result of a command: `text` for people, `value` with `--json`.
     pub fn result(&self, value: &impl Serialize, text: &str) -> Result<()> {
+        if self.quiet {
+            return Ok(());
+        }
         let text = if self.json {
             serde_json::to_string_pretty(value)?
         } else {

@@ -19,6 +19,14 @@ pub fn disparity_beside_image(left: &Rgb, disparity: &Plane, range: (f32, f32)) 
     })
 }
 
+/// Disparity in colour: far is blue, near is red, unknown is black.
+pub fn disparity_picture(disparity: &Plane, range: (f32, f32)) -> RgbImage {
+    let (width, height) = disparity.dimensions();
+    RgbImage::from_fn(width, height, |x, y| {
+        disparity_colour(disparity.get_pixel(x, y).0[0], range)
+    })
+}
+
 fn disparity_colour(disparity: f32, (low, high): (f32, f32)) -> image::Rgb<u8> {
     match disparity.is_finite() {
         true => turbo((disparity - low) / (high - low).max(1e-6)),
@@ -78,9 +86,7 @@ pub fn explained_sheet(pairs: &[Explained]) -> RgbImage {
             // The truth's colours where there is one, so that pictures of a run compare.
             let range = disparity_range(pair.truth.as_ref().unwrap_or(disparity));
             let (width, height) = left.dimensions();
-            let coloured = RgbImage::from_fn(width, height, |x, y| {
-                disparity_colour(disparity.get_pixel(x, y).0[0], range)
-            });
+            let coloured = disparity_picture(disparity, range);
             let wrong = RgbImage::from_fn(width, height, |x, y| {
                 let share = match &pair.truth {
                     Some(truth) => {
@@ -201,7 +207,8 @@ pub fn matches_over_pair(
     picture
 }
 
-fn dot(image: &mut RgbImage, x: f64, y: f64, half: i32, colour: image::Rgb<u8>) {
+/// A square mark of `2 half + 1` pixels.
+pub fn dot(image: &mut RgbImage, x: f64, y: f64, half: i32, colour: image::Rgb<u8>) {
     let (cx, cy) = (x.round() as i32, y.round() as i32);
     for y in cy - half..=cy + half {
         for x in cx - half..=cx + half {
@@ -212,7 +219,8 @@ fn dot(image: &mut RgbImage, x: f64, y: f64, half: i32, colour: image::Rgb<u8>) 
     }
 }
 
-fn bytes(image: &Rgb) -> RgbImage {
+/// An image in 8 bits.
+pub fn bytes(image: &Rgb) -> RgbImage {
     RgbImage::from_fn(image.width(), image.height(), |x, y| {
         byte(image.get_pixel(x, y))
     })

@@ -1,6 +1,8 @@
 //! What a run of `barchan slam` leaves, whatever its method: written here, and read here.
 
 use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -9,6 +11,7 @@ use barchan_geometry::nalgebra::Matrix6;
 use barchan_geometry::{RectifiedRig, Rig, StampedPose, Trajectory};
 use barchan_infer::DisparityMap;
 use barchan_terrain::DenseKeyframe;
+use serde::Serialize;
 
 use crate::output::StagedDir;
 
@@ -72,6 +75,32 @@ pub fn write_dense(out: &StagedDir, frame: usize, left: &Rgb, dense: &DisparityM
         .to_rgb8()
         .save(&file)
         .with_context(|| file.display().to_string())
+}
+
+/// What became of each frame: a line of `log.jsonl` each.
+pub struct RunLog {
+    file: BufWriter<File>,
+}
+
+impl RunLog {
+    /// Begins the log of a run.
+    pub fn create(out: &StagedDir) -> Result<Self> {
+        let path = out.path("log.jsonl")?;
+        let file = File::create(&path).with_context(|| path.display().to_string())?;
+        Ok(Self {
+            file: BufWriter::new(file),
+        })
+    }
+
+    /// Adds the report of a frame.
+    pub fn add(&mut self, report: &impl Serialize) -> Result<()> {
+        writeln!(self.file, "{}", serde_json::to_string(report)?).context("log.jsonl")
+    }
+
+    /// Writes what is left.
+    pub fn finish(mut self) -> Result<()> {
+        self.file.flush().context("log.jsonl")
+    }
 }
 
 /// A run on disk whose key frames have disparity.

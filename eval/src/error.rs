@@ -79,10 +79,4 @@ pub enum EvalError {
         /// Places of known truth in the extent of the estimate.
         truth: usize,
     },
-    /// A cloud is too small to be searched.
-    #[error("a cloud of {points} finite points cannot be compared with: 6 are needed")]
-    FewPoints {
-        /// Its finite points.
-        points: usize,
-    },
 }

@@ -3,7 +3,7 @@
 //! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
 //! [`disparity`] (end-point error, bad pixels, density), [`mod@matches`] (how many each rule accepts,
 //! how many are true), [`elevation`] (differences of heights, whether stated bounds hold) and
-//! [`cloud`] (registration and distances).
+//! [`cloud`] (distances of points).
 //!
 //! What it promises: scores serialise to the JSON keys of the command line; a score is made of at
 //! least one comparison, so no figure is a division by zero; input that cannot be compared gives an
@@ -15,7 +15,6 @@ pub mod cloud;
 pub mod disparity;
 pub mod elevation;
 mod error;
-mod kd_tree;
 pub mod matches;
 pub mod trajectory;
 

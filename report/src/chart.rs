@@ -41,17 +41,25 @@ pub struct Chart {
     pub series: Vec<Series>,
 }
 
-const PALETTE: [RGBColor; 5] = [
+const PALETTE: [RGBColor; 10] = [
     RGBColor(31, 93, 160),
     RGBColor(214, 96, 26),
     RGBColor(46, 125, 60),
     RGBColor(150, 60, 140),
     RGBColor(90, 90, 90),
+    RGBColor(190, 30, 45),
+    RGBColor(23, 165, 175),
+    RGBColor(200, 155, 20),
+    RGBColor(120, 80, 50),
+    RGBColor(230, 120, 180),
 ];
 
 impl Chart {
     /// The chart as SVG.
-    pub(crate) fn svg(&self) -> Result<String, ReportError> {
+    ///
+    /// # Errors
+    /// When it cannot be drawn.
+    pub fn svg(&self) -> Result<String, ReportError> {
         let size = if self.plan { (620, 620) } else { (620, 300) };
         let mut svg = String::new();
         let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();

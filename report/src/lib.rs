@@ -1,7 +1,8 @@
 //! A run as one HTML file that needs no network: figures, charts, pictures, a cloud that turns, a relief that tells
 //! heights.
 //!
-//! What it is for: a [`Report`] is filled by whoever knows what a run holds, and [`Report::html`] makes the page.
+//! What it is for: a [`Report`] is filled by whoever knows what a run holds, and [`Report::html`] makes the page; a
+//! [`Chart`] and a [`Sheet`] of pictures are SVG files alone as well.
 //!
 //! What it promises: everything is inside the file; text is escaped, whatever names the data has; the size is
 //! bounded (at most [`MAX_POINTS`] points, [`MAX_CELLS`] cells and [`MAX_SAMPLES`] marks a line), and the page says where that
@@ -12,6 +13,7 @@
 mod chart;
 mod cloud;
 mod relief;
+mod sheet;
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
@@ -23,6 +25,7 @@ use serde::Serialize;
 pub use chart::{Chart, MAX_SAMPLES, Series, Style};
 pub use cloud::{Cloud3d, MAX_POINTS};
 pub use relief::{MAX_CELLS, Relief};
+pub use sheet::Sheet;
 
 /// Why a page could not be made.
 #[derive(Debug, thiserror::Error)]

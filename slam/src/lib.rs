@@ -1,4 +1,5 @@
-//! Stereo SLAM in the manner of S-PTAM (Pire 2017), helped by dense disparity (Hong 2021, 3.2.3).
+//! Stereo SLAM in the manner of S-PTAM (Pire 2017), helped by dense disparity (Hong 2021, 3.2.3); and what it is
+//! compared with, [`IcpOdometry`] and [`Combined`] (de Jong 2020, chapters 5 and 7).
 //!
 //! What it is for: [`Slam::track`] takes rectified pairs one by one and says where the left camera
 //! was; at key frames it asks a [`DisparityEngine`](barchan_infer::DisparityEngine) for dense
@@ -12,9 +13,11 @@
 
 mod block_cholesky;
 mod bundle_adjustment;
+mod combined;
 mod config;
 mod features;
 mod frame;
+mod icp_odometry;
 mod loops;
 mod map;
 mod map_file;
@@ -26,13 +29,19 @@ mod pose;
 mod pose_graph;
 mod rules;
 mod slam;
+mod stereo_cloud;
 mod tracker;
 mod uncertainty;
 mod vocabulary;
 
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
+pub use combined::{
+    Combined, CombinedConfig, CombinedReport, CombinedResult, Scale, ScaleForm, UpToScale,
+    baseline_factor,
+};
 pub use config::{Detector, SlamConfig};
 pub use features::{Akaze, Descriptor, FeatureDetector, Features, Keypoint, Orb};
+pub use icp_odometry::{IcpOdometry, IcpOdometryConfig, IcpReport, IcpResult};
 pub use loops::{LoopConfig, LoopEvent, LoopPoints};
 pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use map_file::MapFileError;
@@ -42,6 +51,7 @@ pub use pose::{Observation, PoseEstimate, optimise_pose, reprojection_jacobian};
 pub use pose_graph::{PoseEdge, PoseGraph};
 pub use rules::{MatchRules, RuledMatch};
 pub use slam::{FrameReport, Slam, SlamResult};
+pub use stereo_cloud::{Mount, StereoCloud, StereoCloudConfig, StereoClouds};
 pub use vocabulary::{BagOfWords, Vocabulary, VocabularyError};
 
 /// Why SLAM cannot go on.
@@ -63,6 +73,20 @@ pub enum SlamError {
         /// What the engine said.
         source: barchan_infer::InferError,
     },
+    /// No cloud could be made of a frame.
+    #[error("frame {frame}: {source}")]
+    Cloud {
+        /// The frame.
+        frame: String,
+        /// What is wrong with it.
+        source: barchan_terrain::TerrainError,
+    },
+    /// A setting makes no sense.
+    #[error(transparent)]
+    Setting(#[from] barchan_terrain::TerrainError),
+    /// Nothing says what the scale of poses is, or what should is not there.
+    #[error("no scale: {0}")]
+    Scale(String),
     /// A frame has not the size of the rig.
     #[error(
         "frame {frame}: {width} x {height} pixels, but the rig says {rig_width} x {rig_height}"

@@ -4,13 +4,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, open, read_planar};
-use barchan_eval::cloud::{
-    CloudScore, IcpConfig, IcpMethod, Reference, Registration, register, score as score_cloud,
-};
+use barchan_eval::cloud::{CloudScore, score as score_cloud};
 use barchan_eval::disparity::DisparityTally;
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
 use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::nalgebra::Point3;
+use barchan_geometry::registration::{IcpConfig, IcpMethod, Reference, Registration, register};
 use barchan_geometry::{Se3, Trajectory};
 use barchan_terrain::{Cloud, Raster};
 use clap::{Parser, Subcommand};

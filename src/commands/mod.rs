@@ -1,6 +1,7 @@
 //! One module per subcommand.
 
 pub mod adapt;
+pub mod compare;
 pub mod completions;
 pub mod data;
 pub mod demo;

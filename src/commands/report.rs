@@ -157,17 +157,23 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
     report.charts.push(Chart {
         title: "What frames agree on".into(),
         horizontal: "frame".into(),
-        vertical: "features".into(),
+        vertical: "features or points".into(),
         plan: false,
-        series: vec![
-            line("with a disparity", "stereo"),
-            line("map points that agree", "inliers"),
+        // Each method has some of these.
+        series: [
+            line("features with a disparity", "stereo"),
+            line("points of the cloud", "points"),
+            line("features that match the last key frame", "matches"),
+            line("points that agree", "inliers"),
             Series {
                 name: "key frames".into(),
                 style: Style::Marks,
                 samples: samples("inliers", true),
             },
-        ],
+        ]
+        .into_iter()
+        .filter(|s| !s.samples.is_empty())
+        .collect(),
     });
     for event in summary["loop_events"].as_array().into_iter().flatten() {
         let place = &event["earlier_frame"];

@@ -5,6 +5,7 @@ mod bad_input;
 mod chain;
 mod data;
 mod help;
+mod methods;
 mod program;
 mod settings;
 mod smoke;

@@ -1,14 +1,18 @@
 //! Where the camera was, by one of several methods, and what it saw.
 
+mod combined;
+mod icp;
 mod stereo;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use barchan_datasets::StereoSource;
 use barchan_geometry::Rig;
+use barchan_slam::ScaleForm;
 use clap::{Parser, ValueEnum};
+use serde::de::DeserializeOwned;
 
 use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
@@ -22,7 +26,9 @@ use crate::output::{Output, StagedDir};
     barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
     barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
     barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday\n  \
-    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
+    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for\n  \
+    barchan slam --data images/ --method icp --model sgm --out runs/icp        clouds brought onto each other\n  \
+    barchan slam --data images/ --method combined --poses sfm.tum --out runs/c  clouds at poses up to scale")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -63,18 +69,51 @@ pub struct Args {
     keyframe_ratio: Option<f64>,
     #[command(flatten)]
     engine: EngineSettings,
+    /// With --method combined: poses of the left cameras at the times of the frames, in any unit, as structure
+    /// from motion gives them: TUM text
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
+    /// With --method combined: poses of the right cameras in the same unit, for the thesis's scale
+    #[arg(long, value_name = "FILE")]
+    right_poses: Option<PathBuf>,
+    /// With --method combined: where the metre comes from (default corrected)
+    #[arg(long, value_enum)]
+    scale: Option<ScaleBy>,
     #[command(flatten)]
     unchecked: Unchecked,
 }
 
 /// How the camera is followed.
 #[derive(Clone, Copy, ValueEnum)]
-enum Method {
+pub enum Method {
     /// Features in both images, a map of points, loops
     Stereo,
+    /// The cloud of each pair brought onto that of the pair before (de Jong 2020, chapter 5)
+    Icp,
+    /// Clouds at the poses of structure from motion (de Jong 2020, chapter 7)
+    Combined,
+}
+
+/// Where the metre of `--method combined` comes from.
+#[derive(Clone, Copy, ValueEnum)]
+enum ScaleBy {
+    /// Points of stereo, found again in later images
+    Corrected,
+    /// The mean distance between left and right camera
+    Thesis,
+}
+
+impl From<ScaleBy> for ScaleForm {
+    fn from(scale: ScaleBy) -> Self {
+        match scale {
+            ScaleBy::Corrected => Self::Corrected,
+            ScaleBy::Thesis => Self::Thesis,
+        }
+    }
 }
 
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
+    refuse_strangers(&args)?;
     let source: Arc<dyn StereoSource> = open_checked(&args.data, &args.unchecked, output)?.into();
     if (0..source.len()).any(|i| source.frame_rig(i) != source.rig()) {
         bail!(
@@ -86,5 +125,54 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     out.write("rig.toml", Rig::from(*source.rig()).to_toml())?;
     match args.method {
         Method::Stereo => stereo::run(&args, source, out, output, runtime),
+        Method::Icp => icp::run(&args, source, out, output, runtime),
+        Method::Combined => combined::run(&args, source, out, output, runtime),
     }
+}
+
+/// Refuses flags that the method would pass over in silence.
+fn refuse_strangers(args: &Args) -> Result<()> {
+    let (stereo, combined) = (
+        matches!(args.method, Method::Stereo),
+        matches!(args.method, Method::Combined),
+    );
+    let flags = [
+        ("--no-gate", args.no_gate, "stereo", stereo),
+        ("--no-loops", args.no_loops, "stereo", stereo),
+        ("--vocabulary", args.vocabulary.is_some(), "stereo", stereo),
+        ("--map", args.map.is_some(), "stereo", stereo),
+        ("--features", args.features.is_some(), "stereo", stereo),
+        ("--keypoints", args.keypoints.is_some(), "stereo", stereo),
+        (
+            "--keyframe-ratio",
+            args.keyframe_ratio.is_some(),
+            "stereo",
+            stereo,
+        ),
+        ("--poses", args.poses.is_some(), "combined", combined),
+        (
+            "--right-poses",
+            args.right_poses.is_some(),
+            "combined",
+            combined,
+        ),
+        ("--scale", args.scale.is_some(), "combined", combined),
+    ];
+    for (flag, given, owner, asked) in flags {
+        if given && !asked {
+            bail!(
+                "{flag} is of --method {owner}, and says nothing to the method that is asked for"
+            );
+        }
+    }
+    Ok(())
+}
+
+/// The settings of a method: the defaults, changed by a file where one is given.
+fn configured<T: DeserializeOwned + Default>(file: Option<&Path>) -> Result<T> {
+    let Some(path) = file else {
+        return Ok(T::default());
+    };
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    toml::from_str(&text).with_context(|| path.display().to_string())
 }

@@ -1,5 +1,4 @@
 use std::collections::BTreeSet;
-use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -12,11 +11,11 @@ use barchan_slam::{
 use barchan_terrain::{Cloud, CloudPoint};
 use serde::Serialize;
 
-use super::Args;
+use super::{Args, configured};
 use crate::commands::features::FeatureKind;
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
-use crate::slam_run::{RunKeyframe, write_dense, write_poses};
+use crate::slam_run::{RunKeyframe, RunLog, write_dense, write_poses};
 
 #[derive(Serialize)]
 struct Summary {
@@ -49,10 +48,7 @@ pub fn run(
         .transpose()?;
     let engine = load_engine(&args.model, runtime, &args.engine)?;
     out.write("config.toml", toml::to_string(&config)?)?;
-    let log = out.path("log.jsonl")?;
-    let mut log = std::io::BufWriter::new(
-        std::fs::File::create(&log).with_context(|| log.display().to_string())?,
-    );
+    let mut log = RunLog::create(&out)?;
 
     let (rig, detector) = (*source.rig(), config.detector);
     let mut slam = Slam::new(rig, config, Some(engine));
@@ -98,11 +94,10 @@ pub fn run(
         tracked += usize::from(report.tracked);
         track_ms.push(report.ms_track);
         total_ms += report.ms_track + report.ms_disparity;
-        writeln!(log, "{}", serde_json::to_string(&report)?)?;
+        log.add(&report)?;
         bar.inc(1);
     }
-    log.flush()?;
-    drop(log);
+    log.finish()?;
     bar.finish_and_clear();
     if tracked == 0 {
         bail!(
@@ -160,13 +155,7 @@ pub fn run(
 }
 
 fn configuration(args: &Args) -> Result<SlamConfig> {
-    let mut config = match &args.config {
-        None => SlamConfig::default(),
-        Some(path) => {
-            let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-            toml::from_str(&text).with_context(|| path.display().to_string())?
-        }
-    };
+    let mut config: SlamConfig = configured(args.config.as_deref())?;
     config.gate &= !args.no_gate;
     config.loops.enabled &= !args.no_loops;
     config.detector = args.features.map_or(config.detector, FeatureKind::into);

@@ -1,9 +1,9 @@
-use barchan_geometry::nalgebra::Point3;
+use nalgebra::Point3;
 
 /// Points in space, to be asked for the nearest (Bentley 1975): a balanced tree whose nodes are the
 /// middles of slices of one array. Written here because the crates for it change features that the
 /// network library is compiled with.
-pub(crate) struct KdTree {
+pub struct KdTree {
     /// Every point and its index; of a slice the middle divides the others along `axis_of` it.
     points: Vec<(Point3<f64>, usize)>,
     /// The dividing axis of the slice whose middle is here.
@@ -14,18 +14,17 @@ pub(crate) struct KdTree {
 const LEAF: usize = 8;
 
 impl KdTree {
-    /// `points` must be finite.
+    /// A tree of `points`; those that are not finite are never found.
     pub fn new(points: &[Point3<f64>]) -> Self {
+        let indexed = points.iter().copied().zip(0..);
+        let points: Vec<_> = indexed
+            .filter(|(p, _)| p.iter().all(|x| x.is_finite()))
+            .collect();
         let mut tree = Self {
-            points: points
-                .iter()
-                .copied()
-                .enumerate()
-                .map(|(i, p)| (p, i))
-                .collect(),
             axes: vec![0; points.len()],
+            points,
         };
-        let mut slices = vec![(0, points.len())];
+        let mut slices = vec![(0, tree.points.len())];
         while let Some((start, end)) = slices.pop() {
             if end - start <= LEAF {
                 continue;
