@@ -15,6 +15,7 @@ mod bundle_adjustment;
 mod config;
 mod features;
 mod frame;
+mod fusion;
 mod loops;
 mod map;
 mod map_file;
@@ -33,6 +34,9 @@ mod vocabulary;
 pub use bundle_adjustment::{BundleAdjustment, Summary as BundleSummary};
 pub use config::{Detector, SlamConfig};
 pub use features::{Akaze, Descriptor, FeatureDetector, Features, Keypoint, Orb};
+pub use fusion::{
+    DeadReckoning, Fusion, FusionConfig, FusionCounts, Motion, ReckoningForm, VibrationGyro,
+};
 pub use loops::{LoopConfig, LoopEvent, LoopPoints};
 pub use map::{Keyframe, Map, MapPoint, PointId};
 pub use map_file::MapFileError;

@@ -1,0 +1,202 @@
+//! The motion model of Bai 2019 (Uncertainty-based vibration/gyro composite planetary terrain mapping,
+//! 2.4): position and yaw from acceleration and one gyro, nothing else; as printed, and corrected.
+//!
+//! As printed, eq. 36 to 39 count twice and have no velocity: every interval begins at rest, its way is
+//! `3/2 a dt^2` where `1/2 a dt^2` would be right, the gyro is integrated twice, and a rover at
+//! constant speed never moves. Its uncertainty (eq. 44) comes out about as much too small. The
+//! corrected form keeps the velocity, and integrates a rate once. In eq. 42 the derivative of yaw by
+//! yaw is a slip of the pen in both: it is one.
+
+use barchan_datasets::ImuSample;
+use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// Which form of the model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ReckoningForm {
+    /// Eq. 36 to 44 as they stand.
+    Printed,
+    /// With a velocity, and a gyro that reads a rate.
+    Corrected,
+}
+
+/// Where position, velocity and yaw stand in the covariance.
+const VELOCITY: usize = 3;
+const YAW: usize = 6;
+
+/// Position and yaw by dead reckoning. The frame is level, z up, and begins at the first pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VibrationGyro {
+    form: ReckoningForm,
+    /// Metres.
+    pub position: Vector3<f64>,
+    /// Metres a second; stays zero as printed.
+    pub velocity: Vector3<f64>,
+    /// Radians, to the left positive.
+    pub yaw: f64,
+    /// Of position, velocity and yaw.
+    pub covariance: SMatrix<f64, 7, 7>,
+}
+
+impl VibrationGyro {
+    /// At rest at the origin, which is certain.
+    pub fn new(form: ReckoningForm) -> Self {
+        Self {
+            form,
+            position: Vector3::zeros(),
+            velocity: Vector3::zeros(),
+            yaw: 0.0,
+            covariance: SMatrix::zeros(),
+        }
+    }
+
+    /// Moves on by `dt` seconds. `acceleration` is along the axes of the levelled rover and free of
+    /// gravity, m/s^2; `turn` about up is what the paper calls angular acceleration, and a gyro's rate,
+    /// rad/s. `noise` are the deviations of one reading of each.
+    pub fn step(&mut self, acceleration: Vector3<f64>, turn: f64, dt: f64, noise: [f64; 2]) {
+        let heading = *Rotation3::from_axis_angle(&Vector3::z_axis(), self.yaw).matrix();
+        let a = heading * acceleration;
+        let aside = Vector3::z().cross(&a);
+        // By how much an acceleration moves the position, and a reading of the gyro the yaw.
+        let (way, yaw) = match self.form {
+            ReckoningForm::Printed => (1.5 * dt * dt, 1.5 * dt * dt),
+            ReckoningForm::Corrected => (0.5 * dt * dt, dt),
+        };
+        let mut by_state = SMatrix::<f64, 7, 7>::identity();
+        let mut by_noise = SMatrix::<f64, 7, 4>::zeros();
+        by_state
+            .fixed_view_mut::<3, 1>(0, YAW)
+            .copy_from(&(aside * way));
+        by_noise
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(&(heading * way));
+        by_noise[(YAW, 3)] = yaw;
+        self.position += a * way;
+        if self.form == ReckoningForm::Corrected {
+            self.position += self.velocity * dt;
+            self.velocity += a * dt;
+            by_state
+                .fixed_view_mut::<3, 3>(0, VELOCITY)
+                .copy_from(&(Matrix3::identity() * dt));
+            by_state
+                .fixed_view_mut::<3, 1>(VELOCITY, YAW)
+                .copy_from(&(aside * dt));
+            by_noise
+                .fixed_view_mut::<3, 3>(VELOCITY, 0)
+                .copy_from(&(heading * dt));
+        }
+        self.yaw += turn * yaw;
+        let [s_a, s_w] = noise.map(|s| s * s);
+        let omega = Matrix4::from_diagonal(&[s_a, s_a, s_a, s_w].into());
+        self.covariance = by_state * self.covariance * by_state.transpose()
+            + by_noise * omega * by_noise.transpose();
+    }
+}
+
+/// One moment of a dead-reckoned drive.
+#[derive(Clone, Copy, Debug)]
+pub struct DeadReckoning {
+    /// Seconds.
+    pub time: f64,
+    /// Position and yaw, and how well they should be known.
+    pub state: VibrationGyro,
+}
+
+impl DeadReckoning {
+    /// The whole stream of an IMU, from rest. The mean force of the first second says what is up and
+    /// is taken away: a vibration sensor feels no gravity, and the paper never names it. Tilt later on
+    /// is not known and leaks gravity, as it does in the paper. `noise` are densities of accelerometer
+    /// (m/s^2/sqrt(Hz)) and gyro (rad/s/sqrt(Hz)).
+    pub fn along(imu: &[ImuSample], form: ReckoningForm, noise: [f64; 2]) -> Vec<Self> {
+        let Some(start) = imu.first().map(|s| s.time) else {
+            return Vec::new();
+        };
+        let first = &imu[..imu.partition_point(|s| s.time <= start + 1.0).max(1)];
+        let sum: Vector3<f64> = first.iter().map(|s| s.acceleration).sum();
+        let rest = sum / first.len() as f64;
+        let level = Rotation3::rotation_between(&rest, &Vector3::z()).unwrap_or_default();
+
+        let mut state = VibrationGyro::new(form);
+        let mut time = start;
+        let step = |sample: &ImuSample| {
+            let dt = sample.time - time;
+            if dt > 0.0 {
+                let acceleration = level * (sample.acceleration - rest);
+                let turn = (level * sample.rate).z;
+                state.step(acceleration, turn, dt, noise.map(|s| s / dt.sqrt()));
+                time = sample.time;
+            }
+            Self { time, state }
+        };
+        imu.iter().map(step).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DT: f64 = 0.01;
+
+    fn driven(form: ReckoningForm, steps: usize, of: impl Fn(f64) -> (f64, f64)) -> VibrationGyro {
+        let mut state = VibrationGyro::new(form);
+        for k in 0..steps {
+            let (ahead, turn) = of(k as f64 * DT);
+            state.step(Vector3::x() * ahead, turn, DT, [0.05, 0.001]);
+        }
+        state
+    }
+
+    #[test]
+    fn the_corrected_form_follows_the_laws_of_motion() {
+        // From rest, one second of 0.5 m/s^2, then coasting.
+        let pushed = |t: f64| (if t < 1.0 - 1e-9 { 0.5 } else { 0.0 }, 0.0);
+        let state = driven(ReckoningForm::Corrected, 300, pushed);
+        assert!((state.position.x - (0.25 + 2.0 * 0.5)).abs() < 1e-9);
+        let turned = driven(ReckoningForm::Corrected, 100, |_| (0.0, 0.3));
+        assert!((turned.yaw - 0.3).abs() < 1e-9);
+        // Covariance of a random walk of the velocity (specs: s_a sqrt(dt) sqrt(T^3 / 3)).
+        let still = driven(ReckoningForm::Corrected, 6000, |_| (0.0, 0.0));
+        let expected = 0.05 * DT.sqrt() * (60.0f64.powi(3) / 3.0).sqrt();
+        let sigma = still.covariance[(0, 0)].sqrt();
+        assert!((sigma / expected - 1.0).abs() < 0.01, "{sigma} {expected}");
+    }
+
+    #[test]
+    fn as_printed_constant_speed_stands_and_uncertainty_is_far_too_small() {
+        let pushed = |t: f64| (if t < 1.0 - 1e-9 { 0.5 } else { 0.0 }, 0.0);
+        let at_one = driven(ReckoningForm::Printed, 100, pushed);
+        let later = driven(ReckoningForm::Printed, 300, pushed);
+        assert_eq!(at_one.position, later.position);
+        // One interval from rest: three times the way.
+        let once = |form| driven(form, 1, |_| (0.5, 0.0)).position.x;
+        let ratio = once(ReckoningForm::Printed) / once(ReckoningForm::Corrected);
+        assert!((ratio - 3.0).abs() < 1e-9);
+        let sigma = |form| driven(form, 6000, |_| (0.0, 0.0)).covariance[(0, 0)].sqrt();
+        assert!(sigma(ReckoningForm::Corrected) > 1000.0 * sigma(ReckoningForm::Printed));
+    }
+
+    #[test]
+    fn the_noise_of_one_step_can_be_read_back_from_covariances() {
+        // Eq. 50 and 51 undo eq. 44.
+        let mut state = VibrationGyro::new(ReckoningForm::Printed);
+        let noise = [0.05, 0.01];
+        state.step(Vector3::new(0.2, -0.1, 0.3), 0.4, 0.1, noise);
+        let before = state;
+        state.step(Vector3::new(0.1, 0.2, -0.3), 0.2, 0.1, noise);
+        let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), before.yaw);
+        let aside = Vector3::z().cross(&(heading * Vector3::new(0.1, 0.2, -0.3)));
+        let mut by_state = SMatrix::<f64, 7, 7>::identity();
+        by_state
+            .fixed_view_mut::<3, 1>(0, YAW)
+            .copy_from(&(aside * 0.015));
+        let gained = state.covariance - by_state * before.covariance * by_state.transpose();
+        for k in 0..3 {
+            let omega: f64 = gained[(k, k)] / 0.015f64.powi(2);
+            assert!((omega - 0.0025).abs() < 1e-12, "{omega}");
+        }
+        let omega: f64 = gained[(YAW, YAW)] / 0.015f64.powi(2);
+        assert!((omega - 1e-4).abs() < 1e-12, "{omega}");
+    }
+}
