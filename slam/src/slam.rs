@@ -70,6 +70,9 @@ pub struct SlamResult {
     /// anew after the camera was lost: how parts lie to each other is a guess. A loop that joins two
     /// makes them one.
     pub submaps: Vec<usize>,
+    /// How many of `keyframes` follow the one before over a gap that only other sensors led over, in
+    /// the same part of the map.
+    pub joined: usize,
     /// The map, with what was there before.
     pub map: Map,
 }
@@ -135,6 +138,11 @@ impl Slam {
         let config = self.config.fusion;
         self.prior = Fusion::new(sensors, config).map(|fusion| MotionPrior::new(fusion, config));
         self
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SlamConfig {
+        &self.config
     }
 
     /// How often other sensors were believed so far, where there are any.
@@ -292,6 +300,9 @@ impl Slam {
             },
             keyframes: new.iter().map(keyframe).collect(),
             submaps: new.iter().map(|k| k.submap).collect(),
+            joined: (new.windows(2))
+                .filter(|pair| pair[1].carried.is_some() && pair[0].submap == pair[1].submap)
+                .count(),
             map: self.map,
         }
     }

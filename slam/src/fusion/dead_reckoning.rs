@@ -8,6 +8,7 @@
 //! yaw is a slip of the pen in both: it is one.
 
 use barchan_datasets::ImuSample;
+use barchan_geometry::Se3;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -94,13 +95,13 @@ impl VibrationGyro {
     }
 }
 
-/// One moment of a dead-reckoned drive.
-#[derive(Clone, Copy, Debug)]
+/// A dead-reckoned drive.
+#[derive(Clone, Debug)]
 pub struct DeadReckoning {
-    /// Seconds.
-    pub time: f64,
-    /// Position and yaw, and how well they should be known.
-    pub state: VibrationGyro,
+    /// Times in seconds, in order, and where the IMU was.
+    pub states: Vec<(f64, VibrationGyro)>,
+    /// Turns the IMU's axes to level ones at the start.
+    level: Rotation3<f64>,
 }
 
 impl DeadReckoning {
@@ -108,10 +109,10 @@ impl DeadReckoning {
     /// is taken away: a vibration sensor feels no gravity, and the paper never names it. Tilt later on
     /// is not known and leaks gravity, as it does in the paper. `noise` are densities of accelerometer
     /// (m/s^2/sqrt(Hz)) and gyro (rad/s/sqrt(Hz)).
-    pub fn along(imu: &[ImuSample], form: ReckoningForm, noise: [f64; 2]) -> Vec<Self> {
-        let Some(start) = imu.first().map(|s| s.time) else {
-            return Vec::new();
-        };
+    ///
+    /// `None` without readings.
+    pub fn along(imu: &[ImuSample], form: ReckoningForm, noise: [f64; 2]) -> Option<Self> {
+        let start = imu.first()?.time;
         let first = &imu[..imu.partition_point(|s| s.time <= start + 1.0).max(1)];
         let sum: Vector3<f64> = first.iter().map(|s| s.acceleration).sum();
         let rest = sum / first.len() as f64;
@@ -127,9 +128,25 @@ impl DeadReckoning {
                 state.step(acceleration, turn, dt, noise.map(|s| s / dt.sqrt()));
                 time = sample.time;
             }
-            Self { time, state }
+            (time, state)
         };
-        imu.iter().map(step).collect()
+        Some(Self {
+            states: imu.iter().map(step).collect(),
+            level,
+        })
+    }
+
+    /// The last state up to a time. `None` before the first.
+    pub fn at(&self, time: f64) -> Option<&VibrationGyro> {
+        let beyond = self.states.partition_point(|(t, _)| *t <= time + 1e-6);
+        Some(&self.states[beyond.checked_sub(1)?].1)
+    }
+
+    /// The pose of the IMU in a state: maps its points to the level frame of the start.
+    #[allow(non_snake_case)]
+    pub fn T_start_imu(&self, state: &VibrationGyro) -> Se3 {
+        let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), state.yaw);
+        Se3::from_parts(state.position.into(), (heading * self.level).into())
     }
 }
 
@@ -175,6 +192,31 @@ mod tests {
         assert!((ratio - 3.0).abs() < 1e-9);
         let sigma = |form| driven(form, 6000, |_| (0.0, 0.0)).covariance[(0, 0)].sqrt();
         assert!(sigma(ReckoningForm::Corrected) > 1000.0 * sigma(ReckoningForm::Printed));
+    }
+
+    #[test]
+    fn a_stream_is_levelled_and_free_of_gravity() {
+        // An IMU that lies on its side, at rest for a second, then pushed along its own y, which is
+        // level, while it turns about its own x, which is up.
+        let sample = |k: usize| {
+            let moving = k > 100;
+            let push = if moving { 0.2 } else { 0.0 };
+            ImuSample {
+                time: 7.0 + k as f64 * DT,
+                acceleration: Vector3::new(9.81, push, 0.0),
+                rate: Vector3::x() * if moving { 0.1 } else { 0.0 },
+            }
+        };
+        let imu: Vec<ImuSample> = (0..=200).map(sample).collect();
+        assert!(DeadReckoning::along(&[], ReckoningForm::Corrected, [0.0; 2]).is_none());
+        let drive = DeadReckoning::along(&imu, ReckoningForm::Corrected, [0.01, 0.001]).unwrap();
+        assert!(drive.at(6.9).is_none());
+        assert!(drive.at(7.995).unwrap().position.norm() < 1e-9);
+        let end = drive.at(9.0).unwrap();
+        assert!((end.position.norm() - 0.1).abs() < 1e-3, "{end:?}");
+        assert!(end.position.z.abs() < 1e-9 && (end.yaw - 0.1).abs() < 1e-9);
+        let up = drive.T_start_imu(end).rotation * Vector3::x();
+        assert!((up - Vector3::z()).norm() < 1e-9, "{up}");
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Where the camera was, by one of several methods, and what it saw.
 
+mod dead_reckoning;
 mod stereo;
 
 use std::path::{Path, PathBuf};
@@ -21,7 +22,8 @@ use crate::output::{Output, StagedDir};
     barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
     barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
     barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday\n  \
-    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
+    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for\n  \
+    barchan slam --data images/ --no-fusion --out runs/blind   IMU and wheels are not listened to")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -42,6 +44,12 @@ pub struct Args {
     /// Places seen before are not looked for: the trajectory drifts
     #[arg(long)]
     no_loops: bool,
+    /// IMU and wheels are not listened to: what the images do not show is lost
+    #[arg(long)]
+    no_fusion: bool,
+    /// Writes the path by acceleration and gyro alone (Bai 2019) beside: dead_reckoning.tum and .csv
+    #[arg(long, value_enum, value_name = "FORM")]
+    dead_reckoning: Option<dead_reckoning::Form>,
     /// Visual words to recognise places by, from `barchan vocabulary` or DBoW2, instead of the shipped
     #[arg(long, value_name = "FILE")]
     vocabulary: Option<PathBuf>,
