@@ -159,3 +159,28 @@ fn a_camera_that_shows_an_old_picture_is_not_believed() {
         assert!(gap < 0.03, "{k}: {gap} m");
     }
 }
+
+#[test]
+fn half_a_route_in_blooming_light_stays_within_half_a_percent() {
+    let source = open("synth:seed=6,speed=1,frames=120,width=256,height=192").unwrap();
+    let frames = (0..source.len()).map(|k| {
+        let mut frame = source.frame(k).unwrap();
+        // Light that swells until nothing is left of the ground, and ebbs, every four seconds.
+        let swell = 0.5 - 0.5 * (k as f32 * std::f32::consts::TAU / 20.0).cos();
+        let glow = if k < 60 { 0.0 } else { 30.0 * swell.powi(3) };
+        for image in [&mut frame.left, &mut frame.right] {
+            let bloomed = |v: f32| (v * (1.0 + glow) + 0.02 * glow).min(1.0);
+            image.iter_mut().for_each(|v| *v = bloomed(*v));
+        }
+        frame
+    });
+    let run = run(source.as_ref(), true, frames);
+    let carried = run.reports.iter().filter(|r| r.carried).count();
+    assert!(carried >= 15, "{carried}");
+    assert!(run.reports.iter().all(|r| r.tracked || r.carried));
+    assert!(run.result.submaps.iter().all(|s| *s == 0));
+    let truth = source.true_trajectory().unwrap();
+    let score = score(&run.result.trajectory, truth, DEFAULT_TOLERANCE).unwrap();
+    println!("{carried} carried, {} joined, {score:?}", run.result.joined);
+    assert!(score.ate_rmse <= 0.005 * score.length, "{score:?}");
+}

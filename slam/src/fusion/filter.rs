@@ -79,7 +79,7 @@ impl State {
     }
 
     /// The state after `dt` seconds of a constant angular rate and specific force in the IMU's frame
-    /// (Sola 2017, eq. 260, with the attitude of the middle of the interval).
+    /// (Sola 2017, sec. 5.4.1, with the attitude of the middle of the interval).
     fn integrate(&mut self, rate: Vector3<f64>, force: Vector3<f64>, gravity: f64, dt: f64) {
         let half = UnitQuaternion::from_scaled_axis((rate - self.rate_bias) * (0.5 * dt));
         let middle = self.T_nav_imu.rotation * half;
@@ -293,7 +293,7 @@ impl Filter {
         (s.wheels * speed - s.velocity_of_wheels(rate), by_error)
     }
 
-    /// Corrects by standing still (zero-velocity update): the IMU does not move, and what the gyro
+    /// Corrects by standing still (zero-velocity update, Skog 2010): the IMU does not move, and what the gyro
     /// read on average over `seconds` is its bias. `false` when that is refused.
     pub fn stand(&mut self, rate: Vector3<f64>, seconds: f64) -> bool {
         let s = &self.state;
@@ -376,7 +376,7 @@ impl Filter {
         );
     }
 
-    /// The Kalman update (Sola 2017, eq. 274 to 276, in Joseph's form), unless the squared
+    /// The Kalman update (Sola 2017, sec. 6.1, in Joseph's form), unless the squared
     /// Mahalanobis distance of the residual is beyond the gate: then nothing changes.
     fn correct<const M: usize>(
         &mut self,

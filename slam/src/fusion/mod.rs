@@ -5,7 +5,10 @@
 //! frame that images place corrects it. So it knows its biases, the scale of its wheels and where
 //! ahead is when the images bloom or go dark. [`MotionPrior`] holds it against the poses of the map.
 //!
-//! [`dead_reckoning`] is the motion model of Bai 2019, for comparison.
+//! The wheels' yaw rate is not used: a gyro is better at it, and wheels that skid turn otherwise than
+//! they say. Satellite fixes are not used either: they are what routes are judged by.
+//!
+//! [`DeadReckoning`] is the motion model of Bai 2019, for comparison.
 
 mod dead_reckoning;
 mod filter;
@@ -77,8 +80,11 @@ pub struct FusionConfig {
     pub visual_noise: [f64; 2],
     /// See [`FusionConfig::visual_noise`].
     pub visual_noise_share: f64,
-    /// Visual motions refused in a row after which the filter doubts itself.
+    /// Visual motions refused in a row after which the filter doubts itself: it is wrong then.
     pub most_refused: usize,
+    /// A filter that was wrong more often has false settings or clocks. It refuses no more: images
+    /// have the last word.
+    pub most_doubts: usize,
     /// A gap in tracking is joined when the deviation of the way over it is at most this share of the
     /// way, or 5 cm, and that of the turn at most [`FusionConfig::join_turn`].
     pub join_share: f64,
@@ -113,6 +119,7 @@ impl Default for FusionConfig {
             visual_noise: [0.001, 0.0005],
             visual_noise_share: 0.005,
             most_refused: 5,
+            most_doubts: 3,
             join_share: 0.02,
             join_turn: 0.035,
         }
@@ -178,6 +185,8 @@ pub struct FusionCounts {
     pub visual: usize,
     /// Visual motions that contradicted it.
     pub visual_refused: usize,
+    /// How often the filter gave in to them.
+    pub doubts: usize,
     /// Readings of the wheels that corrected it.
     pub wheels: usize,
     /// Readings of the wheels that contradicted it: slip.
@@ -270,8 +279,8 @@ impl Fusion {
     }
 
     /// Corrects by the motion of the camera since the anchor that images show. `false` when it
-    /// contradicts the other sensors and is refused; after some in a row it is the filter that errs,
-    /// and doubts itself.
+    /// contradicts the other sensors and is refused. After some in a row it is the filter that errs,
+    /// and doubts itself; when that happens too often, it corrects itself as it can and refuses no more.
     pub fn correct(&mut self, seen: &Motion) -> bool {
         let Some(filter) = &mut self.filter else {
             return true;
@@ -290,6 +299,8 @@ impl Fusion {
         }
         if self.refused_in_a_row >= self.config.most_refused {
             filter.doubt();
+            self.counts.doubts += 1;
+            self.refused_in_a_row = 0;
         }
         let agrees = filter.see(&motion);
         if agrees {
@@ -299,7 +310,7 @@ impl Fusion {
             self.counts.visual_refused += 1;
             self.refused_in_a_row += 1;
         }
-        agrees
+        agrees || self.counts.doubts > self.config.most_doubts
     }
 
     /// Motions are counted from now on.

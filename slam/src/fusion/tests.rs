@@ -125,6 +125,53 @@ fn standing_still_is_noticed_and_stops_the_drift() {
 }
 
 #[test]
+fn a_filter_that_is_wrong_gives_in_and_in_the_end_keeps_silent() {
+    // An IMU whose clock is a second late.
+    let config = FusionConfig::default();
+    let drive = Drive::new(2, &config, 70.0, f64::INFINITY);
+    let mut sensors = sensors(&drive, 60.0, &config, 2);
+    sensors.imu.iter_mut().for_each(|s| s.time += 1.0);
+    let mut fusion = Fusion::new(&sensors, config).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut anchor: Option<Se3> = None;
+    let (mut refused, mut late) = (0, 0);
+    for k in 6..300 {
+        let time = k as f64 * 0.2;
+        let here = T_nav_cam(&drive, &sensors, time);
+        fusion.advance(time).unwrap();
+        let agrees = anchor.is_none_or(|a| {
+            fusion.correct(&seen(&(a.inverse() * here), [0.001, 0.0005], &mut rng))
+        });
+        refused += usize::from(!agrees);
+        late += usize::from(!agrees && k > 200);
+        // A refused frame is not counted from.
+        if agrees {
+            fusion.anchor();
+            anchor = Some(here);
+        }
+    }
+    println!("{refused} refused, {late} late: {:?}", fusion.counts());
+    assert!(fusion.counts().doubts > config.most_doubts && late == 0);
+    assert!(refused > 10 && refused < 100, "{refused}");
+}
+
+#[test]
+fn an_imu_alone_carries_a_few_seconds() {
+    let config = FusionConfig::default();
+    let drive = Drive::new(7, &config, 40.0, f64::INFINITY);
+    let mut sensors = sensors(&drive, 40.0, &config, 7);
+    sensors.odometry.clear();
+    let mut fusion = Fusion::new(&sensors, config).unwrap();
+    watch(&mut fusion, &drive, &sensors, 30.0);
+    let motion = fusion.advance(33.0).unwrap();
+    let truth = T_nav_cam(&drive, &sensors, 30.0).inverse() * T_nav_cam(&drive, &sensors, 33.0);
+    let off = (truth.translation.vector - motion.T_anchor_now.translation.vector).norm();
+    let (sigma, _) = motion.sigma();
+    println!("off by {off} m, stated {sigma}");
+    assert!(off < 0.1 && off < 4.0 * sigma, "{off} {sigma}");
+}
+
+#[test]
 fn without_readings_nothing_is_said_and_gaps_cost_certainty() {
     let config = FusionConfig::default();
     assert!(Fusion::new(&Sensors::default(), config).is_none());
