@@ -2,8 +2,9 @@
 
 use barchan_datasets::{Rgb, StereoFrame, StereoSource, open};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
-use barchan_geometry::Se3;
-use barchan_slam::{FrameReport, FusionCounts, Slam, SlamConfig, SlamResult};
+use barchan_geometry::nalgebra::{Matrix6, Vector6};
+use barchan_geometry::{Se3, se3};
+use barchan_slam::{FrameReport, Fusion, FusionCounts, Motion, Slam, SlamConfig, SlamResult};
 
 struct Run {
     reports: Vec<FrameReport>,
@@ -64,6 +65,60 @@ fn way(source: &dyn StereoSource, from: usize, to: usize) -> f64 {
         (b - a).norm()
     });
     steps.sum()
+}
+
+/// What images would say of a motion: to 3 mm and a milliradian, as a wave that never repeats.
+#[allow(non_snake_case)]
+fn seen(T_anchor_now: Se3, k: usize) -> Motion {
+    let wave = |axis: usize| 1.4 * ((k * k) as f64 * 0.7 + axis as f64 * 2.1).sin();
+    let sigma = |axis: usize| if axis < 3 { 0.003 } else { 0.001 };
+    let error = Vector6::from_fn(|axis, _| sigma(axis) * wave(axis));
+    Motion {
+        T_anchor_now: se3::exp(&error) * T_anchor_now,
+        covariance: Matrix6::from_diagonal(&Vector6::from_fn(|axis, _| sigma(axis).powi(2))),
+    }
+}
+
+#[test]
+fn the_sensors_of_every_route_carry_twenty_seconds() {
+    for spec in [
+        "route=circle",
+        "route=loop,look=moon",
+        "route=straight,speed=0.2,pan=30",
+        "route=circle,speed=1,stops=5",
+        // The mast turns around at each stop, and looks to the right of ahead between.
+        "route=survey",
+    ] {
+        let source = open(&format!(
+            "synth:seed=7,width=32,height=32,frames=450,{spec}"
+        ))
+        .unwrap();
+        for dark in [120, 210, 340] {
+            let mut fusion = Fusion::new(source.sensors().unwrap(), Default::default()).unwrap();
+            for k in 0..=dark {
+                fusion.advance(k as f64 * 0.2).unwrap();
+                if k > 0 {
+                    let motion =
+                        truth(source.as_ref(), k - 1).inverse() * truth(source.as_ref(), k);
+                    fusion.correct(&seen(motion, k));
+                }
+                fusion.anchor();
+            }
+            let end = dark + 100;
+            let motion = fusion.advance(end as f64 * 0.2).unwrap();
+            let expected = truth(source.as_ref(), dark).inverse() * truth(source.as_ref(), end);
+            let gap = motion.T_anchor_now.translation.vector - expected.translation.vector;
+            let (gap, way) = (gap.norm(), way(source.as_ref(), dark, end));
+            let (sigma, _) = motion.sigma();
+            println!(
+                "{spec} {dark}: {gap:.3} m of {way:.2}, stated {sigma:.3}; {:?}",
+                fusion.counts()
+            );
+            assert!(gap < (0.02 * way).max(0.05), "{spec}: {gap} m of {way}");
+            assert!(gap < 4.0 * sigma, "{spec}: {gap} {sigma}");
+            assert_eq!(fusion.counts().visual_refused, 0, "{spec}");
+        }
+    }
 }
 
 #[test]
