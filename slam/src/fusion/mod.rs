@@ -199,8 +199,8 @@ pub struct FusionCounts {
 
 /// Readings farther apart than this are a gap, seconds.
 const GAP: f64 = 0.1;
-/// Standing still is judged over so many seconds, and gravity found in as many before and after the
-/// start.
+/// Gravity is found in so many seconds before and after the start, and standing still judged over twice
+/// as many.
 const WINDOW: f64 = 0.5;
 
 /// Fuses the streams of a rover as time goes on.
@@ -328,12 +328,10 @@ impl Fusion {
 
     /// Finds roll and pitch by gravity, as the mean around a time feels it.
     fn start(&mut self, time: f64) {
-        let near = self.between(time - WINDOW, time + WINDOW);
-        let sum: Vector3<f64> = near.iter().map(|s| s.acceleration).sum();
-        let force = match near.len() {
-            0 => self.reading(time).map_or(sum, |(_, force)| force),
-            count => sum / count as f64,
-        };
+        let near = mean(self.between(time - WINDOW, time + WINDOW), |s| {
+            s.acceleration
+        });
+        let force = (near.or(self.reading(time).map(|(_, force)| force))).unwrap_or(Vector3::z());
         self.filter = Some(Filter::new(force, self.config));
         self.time = time;
         self.next_odometry = self.odometry.partition_point(|s| s.time <= time);
@@ -413,32 +411,39 @@ impl Fusion {
         }
     }
 
-    /// The mean of the gyro over the last `took` seconds, when wheels, gyro and accelerometer say that
-    /// the rover has stood still for a while. Without wheels nothing does: a glide feels the same.
+    /// The mean of the gyro over `took` seconds, when wheels, gyro and accelerometer say that the rover
+    /// has stood still for a while (Skog 2010 compares such tests). Without wheels nothing does: a glide
+    /// feels the same.
+    ///
+    /// A mast that begins to turn is slow at first. So both halves of the while must read the same, and
+    /// the mean is that of its beginning.
     fn standing(&self, took: f64) -> Option<Vector3<f64>> {
         let c = &self.config;
-        let now = self.next_odometry;
-        let first = self
-            .odometry
-            .partition_point(|s| s.time < self.time - WINDOW);
-        let stood = self.odometry.get(first..now)?;
-        let still = !stood.is_empty() && stood.iter().all(|s| s.speed.abs() < c.standing_speed);
-        let window = self.between(self.time - WINDOW, self.time);
-        if !still || took <= 0.0 || window.len() < 3 {
+        let (start, middle) = (self.time - 2.0 * WINDOW, self.time - WINDOW);
+        let first = self.odometry.partition_point(|s| s.time < start);
+        let stood = self.odometry.get(first..self.next_odometry)?;
+        let still = stood.iter().all(|s| s.speed.abs() < c.standing_speed);
+        let window = self.between(start, self.time);
+        if stood.is_empty() || !still || took <= 0.0 {
             return None;
         }
-        let mean = |of: &dyn Fn(&ImuSample) -> Vector3<f64>, list: &[ImuSample]| {
-            list.iter().map(of).sum::<Vector3<f64>>() / list.len() as f64
-        };
-        let (rate, force) = (mean(&|s| s.rate, window), mean(&|s| s.acceleration, window));
+        let rate = mean(window, |s| s.rate)?;
+        let force = mean(window, |s| s.acceleration)?;
         let quiet = |s: &ImuSample| {
             (s.rate - rate).norm() < c.standing_rate
                 && (s.acceleration - force).norm() < c.standing_force
         };
-        if rate.norm() >= c.standing_rate || !window.iter().all(quiet) {
-            return None;
-        }
-        let recent = self.between(self.time - took, self.time);
-        (!recent.is_empty()).then(|| mean(&|s| s.rate, recent))
+        let begun = mean(self.between(start, middle), |s| s.rate)?;
+        let ended = mean(self.between(middle, self.time), |s| s.rate)?;
+        // Four deviations of the difference of two means.
+        let steady = (ended - begun).amax() < 4.0 * c.rate_noise * (2.0 / WINDOW).sqrt();
+        let stands = rate.norm() < c.standing_rate && window.iter().all(quiet) && steady;
+        mean(self.between(start, start + took), |s| s.rate).filter(|_| stands)
     }
+}
+
+/// The mean of what is read, where anything is.
+fn mean(list: &[ImuSample], of: impl Fn(&ImuSample) -> Vector3<f64>) -> Option<Vector3<f64>> {
+    let sum: Vector3<f64> = list.iter().map(of).sum();
+    (!list.is_empty()).then(|| sum / list.len() as f64)
 }
