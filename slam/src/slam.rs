@@ -140,11 +140,6 @@ impl Slam {
         self
     }
 
-    /// The settings.
-    pub fn config(&self) -> &SlamConfig {
-        &self.config
-    }
-
     /// How often other sensors were believed so far, where there are any.
     pub fn fusion_counts(&self) -> Option<FusionCounts> {
         self.prior.as_ref().map(MotionPrior::counts)
@@ -170,7 +165,8 @@ impl Slam {
 
     /// Places one frame against the map, and makes it a key frame when matches run low: under a
     /// share of the most since the last key frame (Pire 2017). The first frame with enough stereo
-    /// matches is the world; one that comes after many lost ones begins the map anew.
+    /// matches is the world; one that comes after many lost ones begins the map anew, or goes on in it
+    /// where other sensors know the way over the gap well enough.
     ///
     /// # Errors
     /// When the frame has not the size of the rig, or a detector or the engine fails. A frame that
@@ -248,16 +244,10 @@ impl Slam {
             if self.lost > self.config.restart_after && enough_stereo {
                 self.lost = 0;
                 let joined = self.prior.as_ref().is_some_and(MotionPrior::is_sure);
-                let submap = match newest.filter(|_| joined) {
-                    Some(k) => self.map.keyframes[k].submap,
-                    None => self
-                        .map
-                        .keyframes
-                        .iter()
-                        .map(|k| k.submap + 1)
-                        .max()
-                        .unwrap_or(0),
-                };
+                let parts = self.map.keyframes.iter().map(|k| k.submap + 1);
+                let new = parts.max().unwrap_or(0);
+                let last = newest.filter(|_| joined);
+                let submap = last.map_or(new, |k| self.map.keyframes[k].submap);
                 report.reason += match joined {
                     true => "; the map goes on here, where other sensors say",
                     false => "; the map begins anew here, at a pose that is a guess",

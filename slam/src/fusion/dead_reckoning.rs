@@ -95,58 +95,68 @@ impl VibrationGyro {
     }
 }
 
-/// A dead-reckoned drive.
+/// Runs the model along the stream of an IMU.
 #[derive(Clone, Debug)]
 pub struct DeadReckoning {
-    /// Times in seconds, in order, and where the IMU was.
-    pub states: Vec<(f64, VibrationGyro)>,
+    imu: Vec<ImuSample>,
+    /// Densities of the noise of accelerometer and gyro.
+    noise: [f64; 2],
+    /// The mean force while at rest.
+    rest: Vector3<f64>,
     /// Turns the IMU's axes to level ones at the start.
     level: Rotation3<f64>,
+    state: VibrationGyro,
+    /// The first reading that was not used yet.
+    next: usize,
 }
 
 impl DeadReckoning {
-    /// The whole stream of an IMU, from rest. The mean force of the first second says what is up and
-    /// is taken away: a vibration sensor feels no gravity, and the paper never names it. Tilt later on
-    /// is not known and leaks gravity, as it does in the paper. `noise` are densities of accelerometer
+    /// From rest at the first reading. The mean force of the first second says what is up and is taken
+    /// away: a vibration sensor feels no gravity, and the paper never names it. Tilt later on is not
+    /// known and leaks gravity, as it does in the paper. `noise` are densities of accelerometer
     /// (m/s^2/sqrt(Hz)) and gyro (rad/s/sqrt(Hz)).
     ///
     /// `None` without readings.
-    pub fn along(imu: &[ImuSample], form: ReckoningForm, noise: [f64; 2]) -> Option<Self> {
+    pub fn new(imu: &[ImuSample], form: ReckoningForm, noise: [f64; 2]) -> Option<Self> {
         let start = imu.first()?.time;
         let first = &imu[..imu.partition_point(|s| s.time <= start + 1.0).max(1)];
         let sum: Vector3<f64> = first.iter().map(|s| s.acceleration).sum();
         let rest = sum / first.len() as f64;
-        let level = Rotation3::rotation_between(&rest, &Vector3::z()).unwrap_or_default();
-
-        let mut state = VibrationGyro::new(form);
-        let mut time = start;
-        let step = |sample: &ImuSample| {
-            let dt = sample.time - time;
-            if dt > 0.0 {
-                let acceleration = level * (sample.acceleration - rest);
-                let turn = (level * sample.rate).z;
-                state.step(acceleration, turn, dt, noise.map(|s| s / dt.sqrt()));
-                time = sample.time;
-            }
-            (time, state)
-        };
         Some(Self {
-            states: imu.iter().map(step).collect(),
-            level,
+            imu: imu.to_vec(),
+            noise,
+            rest,
+            level: Rotation3::rotation_between(&rest, &Vector3::z()).unwrap_or_default(),
+            state: VibrationGyro::new(form),
+            next: 0,
         })
     }
 
-    /// The last state up to a time. `None` before the first.
-    pub fn at(&self, time: f64) -> Option<&VibrationGyro> {
-        let beyond = self.states.partition_point(|(t, _)| *t <= time + 1e-6);
-        Some(&self.states[beyond.checked_sub(1)?].1)
+    /// The state after all readings up to a time. `None` before the first.
+    pub fn advance(&mut self, time: f64) -> Option<&VibrationGyro> {
+        while let Some(sample) = self.imu.get(self.next) {
+            // Times are written with rounded digits.
+            if sample.time > time + 1e-6 {
+                break;
+            }
+            let last = self.next.checked_sub(1).map(|k| self.imu[k].time);
+            let dt = sample.time - last.unwrap_or(sample.time);
+            if dt > 0.0 {
+                let acceleration = self.level * (sample.acceleration - self.rest);
+                let turn = (self.level * sample.rate).z;
+                let noise = self.noise.map(|s| s / dt.sqrt());
+                self.state.step(acceleration, turn, dt, noise);
+            }
+            self.next += 1;
+        }
+        (self.next > 0).then_some(&self.state)
     }
 
-    /// The pose of the IMU in a state: maps its points to the level frame of the start.
+    /// The pose of the IMU now: maps its points to the level frame of the start.
     #[allow(non_snake_case)]
-    pub fn T_start_imu(&self, state: &VibrationGyro) -> Se3 {
-        let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), state.yaw);
-        Se3::from_parts(state.position.into(), (heading * self.level).into())
+    pub fn T_start_imu(&self) -> Se3 {
+        let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), self.state.yaw);
+        Se3::from_parts(self.state.position.into(), (heading * self.level).into())
     }
 }
 
@@ -208,15 +218,17 @@ mod tests {
             }
         };
         let imu: Vec<ImuSample> = (0..=200).map(sample).collect();
-        assert!(DeadReckoning::along(&[], ReckoningForm::Corrected, [0.0; 2]).is_none());
-        let drive = DeadReckoning::along(&imu, ReckoningForm::Corrected, [0.01, 0.001]).unwrap();
-        assert!(drive.at(6.9).is_none());
-        assert!(drive.at(7.995).unwrap().position.norm() < 1e-9);
-        let end = drive.at(9.0).unwrap();
+        assert!(DeadReckoning::new(&[], ReckoningForm::Corrected, [0.0; 2]).is_none());
+        let mut drive = DeadReckoning::new(&imu, ReckoningForm::Corrected, [0.01, 0.001]).unwrap();
+        assert!(drive.advance(6.9).is_none());
+        assert!(drive.advance(7.995).unwrap().position.norm() < 1e-9);
+        let end = *drive.advance(9.0).unwrap();
         assert!((end.position.norm() - 0.1).abs() < 1e-3, "{end:?}");
         assert!(end.position.z.abs() < 1e-9 && (end.yaw - 0.1).abs() < 1e-9);
-        let up = drive.T_start_imu(end).rotation * Vector3::x();
+        let up = drive.T_start_imu().rotation * Vector3::x();
         assert!((up - Vector3::z()).norm() < 1e-9, "{up}");
+        // Times that run back change nothing.
+        assert_eq!(drive.advance(8.0).copied(), Some(end));
     }
 
     #[test]

@@ -12,7 +12,8 @@ use barchan_slam::{
 use barchan_terrain::{Cloud, CloudPoint};
 use serde::Serialize;
 
-use super::{Args, dead_reckoning};
+use super::Args;
+use super::dead_reckoning::Reckoning;
 use crate::commands::features::FeatureKind;
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
@@ -53,6 +54,9 @@ pub fn run(
     let words = (args.vocabulary.as_deref())
         .map(|path| vocabulary(path, config.detector))
         .transpose()?;
+    let reckoning = (args.dead_reckoning)
+        .map(|form| Reckoning::new(source.sensors(), form, &config.fusion, &args.data))
+        .transpose()?;
     let engine = load_engine(&args.model, runtime, args.threads)?;
     out.write("config.toml", toml::to_string(&config)?)?;
     let log = out.path("log.jsonl")?;
@@ -60,14 +64,13 @@ pub fn run(
         std::fs::File::create(&log).with_context(|| log.display().to_string())?,
     );
 
-    let (rig, detector) = (*source.rig(), config.detector);
+    let (rig, detector, listen) = (*source.rig(), config.detector, config.fusion.enabled);
     let mut slam = Slam::new(rig, config, Some(engine));
     if let Some(words) = words {
         slam = slam.with_vocabulary(words);
     }
-    let fusion = slam.config().fusion;
-    let sensors = source.sensors().cloned();
-    if let Some(sensors) = sensors.as_ref().filter(|_| fusion.enabled) {
+    // A rendered drive makes its sensors when asked for them.
+    if let Some(sensors) = listen.then(|| source.sensors()).flatten() {
         slam = slam.with_sensors(sensors);
     }
     if let Some(file) = &args.map {
@@ -140,9 +143,8 @@ pub fn run(
         output.notice("how well the poses are known cannot be told: there is no covariance.csv");
     }
     write_result(&out, &result)?;
-    if let Some(form) = args.dead_reckoning {
-        let times = result.trajectory.poses.iter().map(|p| p.time);
-        dead_reckoning::write(&out, sensors.as_ref(), form, &fusion, times, &args.data)?;
+    if let Some(reckoning) = reckoning {
+        reckoning.write(&out, result.trajectory.poses.iter().map(|p| p.time))?;
     }
     let map = result.map.to_bytes(&rig)?;
     out.write("map.safetensors", map)?;
