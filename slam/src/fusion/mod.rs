@@ -198,7 +198,7 @@ pub struct FusionCounts {
 }
 
 /// Readings farther apart than this are a gap, seconds.
-const GAP: f64 = 0.1;
+const GAP: f64 = 0.25;
 /// Gravity is found in so many seconds before and after the start, and standing still judged over twice
 /// as many.
 const WINDOW: f64 = 0.5;
