@@ -1,6 +1,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Akaze, FeatureDetector, Orb};
+use crate::fusion::FusionConfig;
 use crate::loops::LoopConfig;
 
 /// Which features SLAM follows.
@@ -79,6 +80,8 @@ pub struct SlamConfig {
     pub seed: u64,
     /// Places seen before.
     pub loops: LoopConfig,
+    /// What sensors besides the cameras are worth.
+    pub fusion: FusionConfig,
 }
 
 impl Default for SlamConfig {
@@ -108,6 +111,7 @@ impl Default for SlamConfig {
             restart_after: 5,
             seed: 1,
             loops: LoopConfig::default(),
+            fusion: FusionConfig::default(),
         }
     }
 }

@@ -17,6 +17,7 @@ mod combined;
 mod config;
 mod features;
 mod frame;
+mod fusion;
 mod icp_odometry;
 mod loops;
 mod map;
@@ -41,6 +42,9 @@ pub use combined::{
 };
 pub use config::{Detector, SlamConfig};
 pub use features::{Akaze, Descriptor, FeatureDetector, Features, Keypoint, Orb};
+pub use fusion::{
+    DeadReckoning, Fusion, FusionConfig, FusionCounts, Motion, ReckoningForm, VibrationGyro,
+};
 pub use icp_odometry::{IcpOdometry, IcpOdometryConfig, IcpReport, IcpResult};
 pub use loops::{LoopConfig, LoopEvent, LoopPoints};
 pub use map::{Keyframe, Map, MapPoint, PointId};

@@ -337,7 +337,8 @@ impl LoopCloser {
                 }
             }
             if edges.last().is_none_or(|e| e.b != k) {
-                edges.push(tie(k - 1, k, GUESS_SIGMA));
+                let sigma = map.keyframes[k].carried.unwrap_or(GUESS_SIGMA);
+                edges.push(tie(k - 1, k, sigma));
             }
         }
         edges.extend(&self.edges);
@@ -457,6 +458,7 @@ mod tests {
             time: frame as f64,
             submap: 0,
             T_cam_world: Se3::identity(),
+            carried: None,
             features: Features {
                 keypoints: vec![at; 3],
                 descriptors: vec![[0; _]; 3],

@@ -27,6 +27,9 @@ pub struct Keyframe {
     pub submap: usize,
     /// Maps world points to the left camera.
     pub T_cam_world: Se3,
+    /// Deviations (metres, radians) of the way from the key frame before, where images did not show it
+    /// and other sensors did.
+    pub carried: Option<(f64, f64)>,
     /// Features of the left image.
     pub features: Features,
     /// Disparity of each feature, where it was matched in the right image, pixels.

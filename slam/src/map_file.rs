@@ -62,6 +62,15 @@ impl Map {
                 })),
             ),
             (
+                "keyframe.carried",
+                Dtype::F64,
+                vec![k, 2],
+                doubles(frames().flat_map(|k| {
+                    let (translation, rotation) = k.carried.unwrap_or((f64::NAN, f64::NAN));
+                    [translation, rotation]
+                })),
+            ),
+            (
                 "keyframe.features",
                 Dtype::I64,
                 vec![k, 1],
@@ -215,6 +224,7 @@ impl Map {
         let times = file.doubles("keyframe.time", 1)?;
         let submaps = file.integers("keyframe.submap")?;
         let poses = file.doubles("keyframe.T_cam_world", 7)?;
+        let carried = file.doubles("keyframe.carried", 2)?;
         let counts = file.integers("keyframe.features")?;
         let bits = file.integers("keyframe.descriptor_bits")?;
         let names = String::from_utf8(file.bytes("keyframe.names", 1)?.to_vec())
@@ -224,6 +234,7 @@ impl Map {
             times.len(),
             submaps.len(),
             poses.len() / 7,
+            carried.len() / 2,
             counts.len(),
             bits.len(),
         ];
@@ -278,6 +289,8 @@ impl Map {
                     Translation3::new(pose[0], pose[1], pose[2]),
                     UnitQuaternion::new_unchecked(turn),
                 ),
+                carried: Some((carried[2 * k], carried[2 * k + 1]))
+                    .filter(|(a, b)| a.is_finite() && b.is_finite()),
                 features: Features {
                     keypoints: range.clone().map(at).collect(),
                     descriptors: (range.clone())
@@ -410,6 +423,7 @@ mod tests {
                 time: 0.1 * k as f64,
                 submap: k / 2,
                 T_cam_world: Se3::new([0.1 * k as f64, 0.2, 0.3].into(), [0.0, 0.1, 0.2].into()),
+                carried: (k == 2).then_some((0.25, 0.01)),
                 features: Features {
                     keypoints: (0..4).map(at).collect(),
                     descriptors: (0..4).map(|f| [(16 * k + f) as u8; 64]).collect(),

@@ -48,6 +48,7 @@ fn add_keyframe(
         time: frame.time,
         submap,
         T_cam_world: placement.T_cam_world,
+        carried: placement.carried,
         points: vec![None; features.keypoints.len()],
         features,
         disparities: seen.disparities.clone(),

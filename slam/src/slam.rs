@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use barchan_datasets::StereoFrame;
+use barchan_datasets::{Sensors, StereoFrame};
 use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
 use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
 use nalgebra::Matrix6;
@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use crate::features::FeatureDetector;
 use crate::frame::Seen;
+use crate::fusion::{Fusion, FusionCounts, MotionPrior};
 use crate::loops::{LoopCloser, LoopEvent};
 use crate::map::{Keyframe, Map};
 use crate::mapping::insert_keyframe;
@@ -37,6 +38,8 @@ pub struct FrameReport {
     pub found_again_at: Option<usize>,
     /// Why it is lost; empty when it is not.
     pub reason: String,
+    /// Whether its pose is that of sensors other than the cameras, from the last tracked frame on.
+    pub carried: bool,
     /// Whether it became a key frame.
     pub keyframe: bool,
     /// How stereo matches were decided, at key frames.
@@ -55,7 +58,8 @@ pub struct FrameReport {
 /// What is left when all frames are through.
 #[derive(Clone, Debug)]
 pub struct SlamResult {
-    /// Every frame in order; a lost one has the pose that was predicted for it.
+    /// Every frame in order; a lost one has the pose that was predicted for it, by sensors where there
+    /// are any.
     pub trajectory: Trajectory,
     /// Frame index, name and pose of each key frame that was made of these frames.
     pub keyframes: Vec<(usize, String, StampedPose)>,
@@ -66,6 +70,9 @@ pub struct SlamResult {
     /// anew after the camera was lost: how parts lie to each other is a guess. A loop that joins two
     /// makes them one.
     pub submaps: Vec<usize>,
+    /// How many of `keyframes` follow the one before over a gap that only other sensors led over, in
+    /// the same part of the map.
+    pub joined: usize,
     /// The map, with what was there before.
     pub map: Map,
 }
@@ -95,6 +102,8 @@ pub struct Slam {
     /// Frames lost in a row.
     lost: usize,
     loops: Option<LoopCloser>,
+    /// What other sensors say of the motion.
+    prior: Option<MotionPrior>,
 }
 
 impl Slam {
@@ -118,7 +127,22 @@ impl Slam {
             known: 0,
             most_inliers: 0,
             lost: 0,
+            prior: None,
         }
+    }
+
+    /// Listens to a rover's other sensors: with an IMU, the fused motion ([`Fusion`]) predicts where
+    /// frames are, carries the camera through images that show nothing, and refuses poses that
+    /// contradict it. Without one nothing changes. To be called before the first frame.
+    pub fn with_sensors(mut self, sensors: &Sensors) -> Self {
+        let config = self.config.fusion;
+        self.prior = Fusion::new(sensors, config).map(|fusion| MotionPrior::new(fusion, config));
+        self
+    }
+
+    /// How often other sensors were believed so far, where there are any.
+    pub fn fusion_counts(&self) -> Option<FusionCounts> {
+        self.prior.as_ref().map(MotionPrior::counts)
     }
 
     /// Recognises places by these words instead of the shipped ones.
@@ -141,7 +165,8 @@ impl Slam {
 
     /// Places one frame against the map, and makes it a key frame when matches run low: under a
     /// share of the most since the last key frame (Pire 2017). The first frame with enough stereo
-    /// matches is the world; one that comes after many lost ones begins the map anew.
+    /// matches is the world; one that comes after many lost ones begins the map anew, or goes on in it
+    /// where other sensors know the way over the gap well enough.
     ///
     /// # Errors
     /// When the frame has not the size of the rig, or a detector or the engine fails. A frame that
@@ -158,6 +183,7 @@ impl Slam {
             found_again_at: None,
             stereo: seen.stereo_count(),
             reason: String::new(),
+            carried: false,
             keyframe: false,
             matches: seen.matches,
             ms_track: 0.0,
@@ -166,15 +192,19 @@ impl Slam {
             dense: None,
         };
         let enough_stereo = report.stereo >= self.config.min_inliers;
-        let T_predicted = self.tracker.predict(frame.time);
+        let fused = (self.prior.as_mut()).and_then(|prior| prior.predict(frame.time));
+        let T_predicted = fused.unwrap_or_else(|| self.tracker.predict(frame.time));
         let guess = Placement {
             T_cam_world: T_predicted,
             sightings: Vec::new(),
+            carried: self.prior.as_ref().and_then(MotionPrior::sigma),
         };
 
         let newest = self.map.keyframes.len().checked_sub(1);
         let local = newest.map_or(vec![], |k| self.map.around(k, self.config.window));
-        if let Some(placement) = self.tracker.track(&seen, frame.time, &self.map, &local) {
+        let placement = (self.tracker).track(&seen, &T_predicted, &self.map, &local);
+        let contradicts = (placement.as_ref()).is_some_and(|p| !self.agrees(&seen, p));
+        if let Some(placement) = placement.filter(|_| !contradicts) {
             report.inliers = placement.sightings.len();
             self.lost = 0;
             self.most_inliers = self.most_inliers.max(report.inliers);
@@ -189,26 +219,41 @@ impl Slam {
         } else if newest.is_none() && enough_stereo {
             report.inliers = report.stereo;
             self.tracker.moved_to(T_predicted, frame.time);
+            self.count_from(&seen, &guess);
             self.make_keyframe(frame, seen, &guess, 0, &mut report)?;
-        } else if let Some((place, placement)) = self.find_again(&seen) {
+        } else if let Some((place, placement)) =
+            (!contradicts).then(|| self.find_again(&seen)).flatten()
+        {
             // What follows is tracked against this place: it is the newest key frame at once.
             let submap = self.map.keyframes[place].submap;
             report.found_again_at = Some(self.map.keyframes[place].frame);
             report.inliers = placement.sightings.len();
             self.lost = 0;
             self.tracker.lost_at(placement.T_cam_world, frame.time);
+            self.count_from(&seen, &placement);
             self.make_keyframe(frame, seen, &placement, submap, &mut report)?;
         } else {
             report.tracked = false;
+            report.carried = fused.is_some();
             report.reason = seen.describe();
+            if contradicts {
+                report.reason += "; the motion that they show contradicts the other sensors";
+            }
             self.lost += 1;
             self.tracker.lost_at(T_predicted, frame.time);
             if self.lost > self.config.restart_after && enough_stereo {
-                report.reason += "; the map begins anew here, at a pose that is a guess";
                 self.lost = 0;
+                let joined = self.prior.as_ref().is_some_and(MotionPrior::is_sure);
                 let parts = self.map.keyframes.iter().map(|k| k.submap + 1);
                 let new = parts.max().unwrap_or(0);
-                self.make_keyframe(frame, seen, &guess, new, &mut report)?;
+                let last = newest.filter(|_| joined);
+                let submap = last.map_or(new, |k| self.map.keyframes[k].submap);
+                report.reason += match joined {
+                    true => "; the map goes on here, where other sensors say",
+                    false => "; the map begins anew here, at a pose that is a guess",
+                };
+                self.count_from(&seen, &guess);
+                self.make_keyframe(frame, seen, &guess, submap, &mut report)?;
             } else {
                 self.place(frame.time, T_predicted);
             }
@@ -245,6 +290,9 @@ impl Slam {
             },
             keyframes: new.iter().map(keyframe).collect(),
             submaps: new.iter().map(|k| k.submap).collect(),
+            joined: (new.windows(2))
+                .filter(|pair| pair[1].carried.is_some() && pair[0].submap == pair[1].submap)
+                .count(),
             map: self.map,
         }
     }
@@ -261,6 +309,28 @@ impl Slam {
             let placement = self.tracker.track_by_looks(seen, &self.map, &local)?;
             Some((place, placement))
         })
+    }
+
+    /// Whether the pose of a placement is one that other sensors can believe. If so, motions are
+    /// counted from it on.
+    fn agrees(&mut self, seen: &Seen, placement: &Placement) -> bool {
+        let Some(prior) = &mut self.prior else {
+            return true;
+        };
+        let covariance = self.tracker.covariance(seen, &self.map, placement);
+        let agrees = prior.agrees(&placement.T_cam_world, &covariance);
+        if agrees {
+            prior.placed(placement.T_cam_world, covariance);
+        }
+        agrees
+    }
+
+    /// Other sensors count motions from this placement on, whatever they think of it.
+    fn count_from(&mut self, seen: &Seen, placement: &Placement) {
+        if let Some(prior) = &mut self.prior {
+            let covariance = self.tracker.covariance(seen, &self.map, placement);
+            prior.placed(placement.T_cam_world, covariance);
+        }
     }
 
     /// Dense disparity of the frame, stereo matches gated by it (Hong 2021, 3.2.3), and the frame
@@ -300,6 +370,9 @@ impl Slam {
         self.most_inliers = report.inliers;
         let settled = self.map.keyframes[keyframe].T_cam_world;
         self.tracker.corrected_to(settled);
+        if let Some(prior) = &mut self.prior {
+            prior.corrected_to(settled);
+        }
         self.place(frame.time, settled);
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! Where was the camera when this frame was taken? (Pire 2017, tracking thread.)
 
 use barchan_geometry::{RectifiedRig, Se3, se3};
-use nalgebra::{Vector2, Vector6};
+use nalgebra::{Matrix6, Vector2, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -9,7 +9,7 @@ use crate::features::Descriptor;
 use crate::frame::Seen;
 use crate::map::{Map, PointId};
 use crate::matching::{ProjectedMatches, find_points, match_all};
-use crate::pose::{Observation, optimise_pose, sample_pose};
+use crate::pose::{Observation, optimise_pose, reprojection_jacobian, sample_pose};
 use crate::{Keypoint, SlamConfig};
 
 /// Where a frame is, and what tells so.
@@ -20,6 +20,9 @@ pub(crate) struct Placement {
     pub T_cam_world: Se3,
     /// Map points that agree with the pose.
     pub sightings: Vec<Sighting>,
+    /// Deviations of the way to it, where no map point tells but other sensors do; see
+    /// [`Keyframe::carried`](crate::Keyframe::carried).
+    pub carried: Option<(f64, f64)>,
 }
 
 /// A map point seen by a feature of a frame.
@@ -51,16 +54,20 @@ impl Tracker {
         }
     }
 
-    /// Places a frame: predict by constant velocity, match the local map where the prediction puts
-    /// it, optimise the pose; where that fails, match the newest key frames by looks alone, sample
+    /// Places a frame: match the local map where the predicted pose puts it, optimise the pose; where that fails, match the newest key frames by looks alone, sample
     /// a pose and optimise that. `None` when neither finds a pose that enough points agree with.
     ///
     /// `local` are the key frames of the local map, the nearest first.
     #[allow(non_snake_case)]
-    pub fn track(&self, seen: &Seen, time: f64, map: &Map, local: &[usize]) -> Option<Placement> {
-        let T_predicted = self.predict(time);
+    pub fn track(
+        &self,
+        seen: &Seen,
+        T_predicted: &Se3,
+        map: &Map,
+        local: &[usize],
+    ) -> Option<Placement> {
         let points = map.points_of(local);
-        self.track_by_projection(seen, map, &points, &T_predicted)
+        self.track_by_projection(seen, map, &points, T_predicted)
             .or_else(|| self.track_by_looks(seen, map, local))
     }
 
@@ -183,7 +190,26 @@ impl Tracker {
         holds.then(|| Placement {
             T_cam_world: pose.T_cam_world,
             sightings: inliers.filter(|(_, i)| **i).map(|(s, _)| s).collect(),
+            carried: None,
         })
+    }
+
+    /// Covariance of the twist `xi` (translation first) of which `exp(xi) T_cam_world` is the true
+    /// pose of a placement, as its sightings tell. A pose without any is where it is by definition; one
+    /// that they do not fix is known to a metre and a radian.
+    pub fn covariance(&self, seen: &Seen, map: &Map, placement: &Placement) -> Matrix6<f64> {
+        if placement.sightings.is_empty() {
+            return Matrix6::zeros();
+        }
+        let mut information = Matrix6::zeros();
+        for s in &placement.sightings {
+            let o = self.observation(seen, map, s.point, s.feature, &s.at);
+            let p_cam = placement.T_cam_world * o.point;
+            let jacobian = o.whiten(reprojection_jacobian(&self.rig, &p_cam));
+            information += jacobian.transpose() * jacobian;
+        }
+        let known = information.cholesky().map(|c| c.inverse());
+        known.unwrap_or_else(Matrix6::identity)
     }
 
     /// Where the picture of a point fits best around a matched feature. A corner detector puts a

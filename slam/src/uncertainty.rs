@@ -13,7 +13,7 @@ use crate::pose_graph::{PoseEdge, PoseGraph};
 
 /// Covariance of the pose of each key frame against the first of its part of the map: position and
 /// rotation vector, both along the axes of the world. Each key frame hangs on the one before it that
-/// shares most points, as well as these points can tell, and on what loops measured; a motion is
+/// shares most points, as well as these points can tell (or other sensors, over a gap), and on what loops measured; a motion is
 /// counted once, for sightings of one point err alike. `None` when the graph does not hold together.
 pub(crate) fn pose_covariances(
     map: &Map,
@@ -32,8 +32,9 @@ pub(crate) fn pose_covariances(
         }
         let nearest = map.shared_with(k).into_iter().find(|(other, _)| *other < k);
         let a = nearest.map_or(k - 1, |(other, _)| other);
-        let (sigma_translation, sigma_rotation) =
-            motion_sigma(map, a, k, rig, config).unwrap_or(GUESS_SIGMA);
+        let (sigma_translation, sigma_rotation) = motion_sigma(map, a, k, rig, config)
+            .or(keyframe.carried)
+            .unwrap_or(GUESS_SIGMA);
         edges.push(PoseEdge {
             a,
             b: k,

@@ -4,6 +4,7 @@ mod adapt;
 mod bad_input;
 mod chain;
 mod data;
+mod fusion;
 mod help;
 mod methods;
 mod program;

@@ -10,7 +10,7 @@ use image::RgbImage;
 
 use super::maps::from_above;
 use super::{Compared, sampled};
-use crate::engine::load_engine;
+use crate::engine::{EngineSettings, load_engine};
 use crate::output::StagedDir;
 use crate::preview::{bytes, disparity_picture, disparity_range, dot};
 
@@ -180,7 +180,7 @@ pub fn disparities(
     let mut engines = vec![];
     for model in models {
         // One that cannot be had has already failed as a run.
-        if let Ok(engine) = load_engine(model, runtime, 0) {
+        if let Ok(engine) = load_engine(model, runtime, &EngineSettings::default()) {
             engines.push((model, engine));
         }
     }

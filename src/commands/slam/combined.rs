@@ -42,7 +42,7 @@ pub fn run(
     config.scale = args.scale.map_or(config.scale, super::ScaleBy::into);
     let poses = poses_up_to_scale(args)?;
     let scale_form = config.scale;
-    let engine = load_engine(&args.model, runtime, args.threads)?;
+    let engine = load_engine(&args.model, runtime, &args.engine)?;
     let engine_name = engine.name();
     out.write("config.toml", toml::to_string(&config)?)?;
     let mut log = RunLog::create(&out)?;

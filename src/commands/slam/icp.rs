@@ -38,7 +38,7 @@ pub fn run(
     runtime: Option<&Path>,
 ) -> Result<()> {
     let config: IcpOdometryConfig = configured(args.config.as_deref())?;
-    let engine = load_engine(&args.model, runtime, args.threads)?;
+    let engine = load_engine(&args.model, runtime, &args.engine)?;
     let engine_name = engine.name();
     out.write("config.toml", toml::to_string(&config)?)?;
     let mut log = RunLog::create(&out)?;

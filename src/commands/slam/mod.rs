@@ -1,6 +1,7 @@
 //! Where the camera was, by one of several methods, and what it saw.
 
 mod combined;
+mod dead_reckoning;
 mod icp;
 mod stereo;
 
@@ -28,7 +29,8 @@ use crate::output::{Output, StagedDir};
     barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday\n  \
     barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for\n  \
     barchan slam --data images/ --method icp --model sgm --out runs/icp        clouds brought onto each other\n  \
-    barchan slam --data images/ --method combined --poses sfm.tum --out runs/c  clouds at poses up to scale")]
+    barchan slam --data images/ --method combined --poses sfm.tum --out runs/c  clouds at poses up to scale\n  \
+    barchan slam --data images/ --no-fusion --out runs/blind   IMU and wheels are not listened to")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -49,6 +51,12 @@ pub struct Args {
     /// Places seen before are not looked for: the trajectory drifts
     #[arg(long)]
     no_loops: bool,
+    /// IMU and wheels are not listened to: what the images do not show is lost
+    #[arg(long)]
+    no_fusion: bool,
+    /// Writes the path by acceleration and gyro alone (Bai 2019) beside: dead_reckoning.tum and .csv
+    #[arg(long, value_enum, value_name = "FORM")]
+    dead_reckoning: Option<dead_reckoning::Form>,
     /// Visual words to recognise places by, from `barchan vocabulary` or DBoW2, instead of the shipped
     #[arg(long, value_name = "FILE")]
     vocabulary: Option<PathBuf>,

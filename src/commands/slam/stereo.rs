@@ -6,11 +6,12 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{StereoSource, prefetch};
 use barchan_geometry::RectifiedRig;
 use barchan_slam::{
-    Detector, LoopEvent, Map, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary,
+    Detector, FusionCounts, LoopEvent, Map, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary,
 };
 use barchan_terrain::{Cloud, CloudPoint};
 use serde::Serialize;
 
+use super::dead_reckoning::Reckoning;
 use super::{Args, configured};
 use crate::commands::features::FeatureKind;
 use crate::engine::load_engine;
@@ -26,6 +27,12 @@ struct Summary {
     loop_events: Vec<LoopEvent>,
     submaps: usize,
     found_again: usize,
+    /// Frames whose pose is that of IMU and wheels.
+    carried: usize,
+    /// Gaps over which these led on in the same part of the map.
+    joined: usize,
+    /// How often they were believed; none where there are none.
+    fusion: Option<FusionCounts>,
     points: usize,
     ms_track_median: f64,
     ms_track_p95: f64,
@@ -46,14 +53,21 @@ pub fn run(
     let words = (args.vocabulary.as_deref())
         .map(|path| vocabulary(path, config.detector))
         .transpose()?;
+    let reckoning = (args.dead_reckoning)
+        .map(|form| Reckoning::new(source.sensors(), form, &config.fusion, &args.data))
+        .transpose()?;
     let engine = load_engine(&args.model, runtime, &args.engine)?;
     out.write("config.toml", toml::to_string(&config)?)?;
     let mut log = RunLog::create(&out)?;
 
-    let (rig, detector) = (*source.rig(), config.detector);
+    let (rig, detector, listen) = (*source.rig(), config.detector, config.fusion.enabled);
     let mut slam = Slam::new(rig, config, Some(engine));
     if let Some(words) = words {
         slam = slam.with_vocabulary(words);
+    }
+    // A rendered drive makes its sensors when asked for them.
+    if let Some(sensors) = listen.then(|| source.sensors()).flatten() {
+        slam = slam.with_sensors(sensors);
     }
     if let Some(file) = &args.map {
         slam = slam.with_map(read_map(file, &rig, detector)?);
@@ -63,12 +77,17 @@ pub fn run(
     let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
         (0, vec![], vec![], MatchCounts::default());
     let mut total_ms = 0.0;
-    let (mut loops, mut found_again) = (Vec::<LoopEvent>::new(), 0);
+    let (mut loops, mut found_again, mut carried) = (Vec::<LoopEvent>::new(), 0, 0);
     for frame in prefetch(source, (0..frames).collect(), 4) {
         let frame = frame?;
         let mut report = slam.track(&frame)?;
         if !report.tracked {
-            output.notice(&format!("frame {} is lost: {}", report.name, report.reason));
+            let what = if report.carried {
+                "shows no place, and IMU and wheels carry on"
+            } else {
+                "is lost"
+            };
+            output.notice(&format!("frame {} {what}: {}", report.name, report.reason));
         }
         if let Some(dense) = report.dense.take() {
             write_dense(&out, report.frame, &frame.left, &dense)?;
@@ -92,6 +111,7 @@ pub fn run(
             ));
         }
         tracked += usize::from(report.tracked);
+        carried += usize::from(report.carried);
         track_ms.push(report.ms_track);
         total_ms += report.ms_track + report.ms_disparity;
         log.add(&report)?;
@@ -106,6 +126,7 @@ pub fn run(
         );
     }
 
+    let counts = slam.fusion_counts();
     let result = slam.finish();
     let submaps = result.submaps.iter().collect::<BTreeSet<_>>().len();
     if submaps > 1 {
@@ -117,6 +138,9 @@ pub fn run(
         output.notice("how well the poses are known cannot be told: there is no covariance.csv");
     }
     write_result(&out, &result)?;
+    if let Some(reckoning) = reckoning {
+        reckoning.write(&out, result.trajectory.poses.iter().map(|p| p.time))?;
+    }
     let map = result.map.to_bytes(&rig)?;
     out.write("map.safetensors", map)?;
     let (ms_track_median, ms_track_p95) = percentiles(track_ms);
@@ -128,6 +152,9 @@ pub fn run(
         loop_events: loops,
         submaps,
         found_again,
+        carried,
+        joined: result.joined,
+        fusion: counts,
         points: result.map.points.len(),
         ms_track_median,
         ms_track_p95,
@@ -137,10 +164,20 @@ pub fn run(
     };
     out.write_json("summary.json", &summary)?;
     out.finish()?;
+    let fused = counts.map_or(String::new(), |c| {
+        format!(
+            "IMU and wheels: {carried} frames carried, {} gaps joined; refused {} of {} motions in images, {} of {} readings of wheels\n",
+            summary.joined,
+            c.visual_refused,
+            c.visual_refused + c.visual,
+            c.wheels_refused,
+            c.wheels_refused + c.wheels,
+        )
+    });
     let text = format!(
         "{tracked} of {frames} frames tracked, {} key frames, {} loops, {} points; {ms_track_median:.1} ms a frame (p95 {ms_track_p95:.1}), \
          {:.1} ms disparity a key frame, {:.1} frames/s\nstereo matches at key frames: {} by ratio, {} more by disparity, {} refused by disparity\n\
-         {}: trajectory.tum trajectory.kitti keyframes.tum map.ply",
+         {fused}{}: trajectory.tum trajectory.kitti keyframes.tum map.ply",
         summary.keyframes,
         summary.loops,
         summary.points,
@@ -158,6 +195,7 @@ fn configuration(args: &Args) -> Result<SlamConfig> {
     let mut config: SlamConfig = configured(args.config.as_deref())?;
     config.gate &= !args.no_gate;
     config.loops.enabled &= !args.no_loops;
+    config.fusion.enabled &= !args.no_fusion;
     config.detector = args.features.map_or(config.detector, FeatureKind::into);
     config.features = args.keypoints.unwrap_or(config.features);
     config.keyframe_ratio = args.keyframe_ratio.unwrap_or(config.keyframe_ratio);
