@@ -1,5 +1,6 @@
 //! Where the camera was, by one of several methods, and what it saw.
 
+mod sfm;
 mod stereo;
 
 use std::path::{Path, PathBuf};
@@ -8,6 +9,7 @@ use std::sync::Arc;
 use anyhow::{Result, bail};
 use barchan_datasets::StereoSource;
 use barchan_geometry::Rig;
+use barchan_slam::sfm::TrackKind;
 use clap::{Parser, ValueEnum};
 
 use crate::commands::features::FeatureKind;
@@ -21,7 +23,8 @@ use crate::output::{Output, StagedDir};
     barchan slam --data images/ --features akaze --out runs/a  features that last longer, and take longer\n  \
     barchan slam --data images/ --no-gate --out runs/plain     features alone decide on matches\n  \
     barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday\n  \
-    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for")]
+    barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for\n  \
+    barchan slam --data images/ --method sfm --out runs/sfm    one camera and bundle adjustment; sparse points, no --model")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -60,6 +63,9 @@ pub struct Args {
     /// A key frame is made when matches fall under this share
     #[arg(long)]
     keyframe_ratio: Option<f64>,
+    /// How --method sfm follows things from image to image (default sift)
+    #[arg(long, value_enum)]
+    tracks: Option<Tracks>,
     /// Threads of the disparity engine; 0 leaves it to the engine
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -72,6 +78,26 @@ pub struct Args {
 enum Method {
     /// Features in both images, a map of points, loops
     Stereo,
+    /// Structure from motion by the left camera alone; the right one tells the metre
+    Sfm,
+}
+
+/// How `--method sfm` follows things from image to image.
+#[derive(Clone, Copy, ValueEnum)]
+enum Tracks {
+    /// Key points and descriptors
+    Sift,
+    /// Optical flow: faster, and lost when the camera jumps
+    Klt,
+}
+
+impl From<Tracks> for TrackKind {
+    fn from(tracks: Tracks) -> Self {
+        match tracks {
+            Tracks::Sift => Self::Sift,
+            Tracks::Klt => Self::Klt,
+        }
+    }
 }
 
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
@@ -86,5 +112,6 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     out.write("rig.toml", Rig::from(*source.rig()).to_toml())?;
     match args.method {
         Method::Stereo => stereo::run(&args, source, out, output, runtime),
+        Method::Sfm => sfm::run(&args, source, out, output),
     }
 }
