@@ -10,7 +10,7 @@ use super::sift::SiftTracks;
 pub enum TrackKind {
     /// Key points and descriptors; SIFT stands in for the SURF of de Jong 2020.
     Sift,
-    /// Optical flow: faster, and lost when the camera jumps.
+    /// Optical flow: more tracks that last longer, lost when the camera jumps.
     Klt,
 }
 

@@ -87,7 +87,7 @@ enum Method {
 enum Tracks {
     /// Key points and descriptors
     Sift,
-    /// Optical flow: faster, and lost when the camera jumps
+    /// Optical flow: more tracks, which last longer, but are lost when the camera jumps
     Klt,
 }
 
