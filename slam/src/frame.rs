@@ -21,6 +21,23 @@ pub(crate) struct Seen {
     pub grid: Grid,
 }
 
+/// Says so when the images have not the size of the rig.
+pub(crate) fn check_size(frame: &StereoFrame, rig: &RectifiedRig) -> Result<(), SlamError> {
+    for image in [&frame.left, &frame.right] {
+        let (width, height) = image.dimensions();
+        if (width as usize, height as usize) != (rig.width, rig.height) {
+            return Err(SlamError::Size {
+                frame: frame.name.clone(),
+                width,
+                height,
+                rig_width: rig.width,
+                rig_height: rig.height,
+            });
+        }
+    }
+    Ok(())
+}
+
 impl Seen {
     /// Finds features in both images at once and matches them along rows, on looks alone.
     pub fn new(
@@ -29,18 +46,7 @@ impl Seen {
         detector: &dyn FeatureDetector,
         config: &SlamConfig,
     ) -> Result<Self, SlamError> {
-        for image in [&frame.left, &frame.right] {
-            let (width, height) = image.dimensions();
-            if (width as usize, height as usize) != (rig.width, rig.height) {
-                return Err(SlamError::Size {
-                    frame: frame.name.clone(),
-                    width,
-                    height,
-                    rig_width: rig.width,
-                    rig_height: rig.height,
-                });
-            }
-        }
+        check_size(frame, rig)?;
         let grey = [luma(&frame.left), luma(&frame.right)];
         let (left, right) = rayon::join(|| detector.detect(&grey[0]), || detector.detect(&grey[1]));
         let failed = |message| SlamError::Features {

@@ -4,6 +4,7 @@
 //! What it is for: [`Slam::track`] takes rectified pairs one by one and says where the left camera
 //! was; at key frames it asks a [`DisparityEngine`](barchan_infer::DisparityEngine) for dense
 //! disparity, uses it to accept more feature matches, and hands it out for mapping.
+//! [`sfm`] follows the left camera alone, as de Jong 2020 does.
 //!
 //! What it promises: the world is the first left camera (x right, y down, z forward); the same
 //! images give the same result, bit by bit; a frame that cannot be placed is reported as lost with a
@@ -29,6 +30,7 @@ mod places;
 mod pose;
 mod pose_graph;
 mod rules;
+pub mod sfm;
 mod slam;
 mod stereo_cloud;
 mod tracker;

@@ -172,37 +172,60 @@ fn nearest_and_rival(
     Some((best, distance, rival))
 }
 
-/// Zero-mean correlation of an 11x11 window along the row around the coarse match, and a parabola
-/// through its peak. `None` when the peak is not inside the search.
-fn refine_disparity([left, right]: [&Plane; 2], keypoint: &Keypoint, coarse: f64) -> Option<f64> {
+/// An 11x11 window of an image, its mean taken out.
+pub(crate) struct Window {
+    values: [f32; Self::SIDE * Self::SIDE],
+    energy: f32,
+}
+
+impl Window {
     const RADIUS: i64 = 5;
-    const REACH: i64 = 4;
-    let (u, v) = (keypoint.u.round() as i64, keypoint.v.round() as i64);
-    let u_right = (keypoint.u - coarse).round() as i64;
-    let (width, height) = (i64::from(left.width()), i64::from(left.height()));
-    let inside = |x: i64, reach: i64| x - RADIUS - reach >= 0 && x + RADIUS + reach < width;
-    if !(inside(u, 0) && inside(u_right, REACH) && v >= RADIUS && v + RADIUS < height) {
-        return None;
-    }
-    const SIDE: usize = 2 * RADIUS as usize + 1;
-    let window = |image: &Plane, x: i64| {
-        let mut values = [0.0f32; SIDE * SIDE];
-        for (row, dy) in values.chunks_exact_mut(SIDE).zip(-RADIUS..) {
-            let start = ((v + dy) * width + x - RADIUS) as usize;
-            row.copy_from_slice(&image.as_raw()[start..start + SIDE]);
+    const SIDE: usize = 2 * Self::RADIUS as usize + 1;
+
+    /// The window around a pixel; `None` where it would leave the image.
+    pub fn cut(image: &Plane, u: i64, v: i64) -> Option<Self> {
+        let (width, height) = (i64::from(image.width()), i64::from(image.height()));
+        let inside = |x: i64, size: i64| x >= Self::RADIUS && x + Self::RADIUS < size;
+        if !(inside(u, width) && inside(v, height)) {
+            return None;
+        }
+        let mut values = [0.0f32; Self::SIDE * Self::SIDE];
+        for (row, dy) in values.chunks_exact_mut(Self::SIDE).zip(-Self::RADIUS..) {
+            let start = ((v + dy) * width + u - Self::RADIUS) as usize;
+            row.copy_from_slice(&image.as_raw()[start..start + Self::SIDE]);
         }
         let mean = values.iter().sum::<f32>() / values.len() as f32;
         values.iter_mut().for_each(|value| *value -= mean);
-        values
-    };
-    let product = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
-    let reference = window(left, u);
-    let energy = product(&reference, &reference);
+        let energy = product(&values, &values);
+        Some(Self { values, energy })
+    }
+
+    /// How alike two windows are, whatever their brightness and contrast: 1 for the same.
+    pub fn correlation(&self, other: &Self) -> f32 {
+        let norm = (self.energy * other.energy).sqrt().max(1e-9);
+        product(&self.values, &other.values) / norm
+    }
+}
+
+fn product(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Zero-mean correlation of a window along the row around the coarse match, and a parabola through its
+/// peak. `None` when the peak is not inside the search.
+pub(crate) fn refine_disparity(
+    [left, right]: [&Plane; 2],
+    keypoint: &Keypoint,
+    coarse: f64,
+) -> Option<f64> {
+    const REACH: i64 = 4;
+    let (u, v) = (keypoint.u.round() as i64, keypoint.v.round() as i64);
+    let u_right = (keypoint.u - coarse).round() as i64;
+    let reference = Window::cut(left, u, v)?;
     let mut scores = [0.0f64; 2 * REACH as usize + 1];
     for (score, shift) in scores.iter_mut().zip(-REACH..) {
-        let other = window(right, u_right + shift);
-        let norm = (energy * product(&other, &other)).sqrt().max(1e-9);
-        *score = f64::from(product(&reference, &other) / norm);
+        let other = Window::cut(right, u_right + shift, v)?;
+        *score = f64::from(reference.correlation(&other));
     }
     let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]))?;
     if best == 0 || best + 1 == scores.len() || scores[best] < 0.6 {

@@ -4,9 +4,11 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{StereoSource, prefetch};
 use barchan_geometry::Trajectory;
+use barchan_slam::sfm::SfmConfig;
 use barchan_slam::{Combined, CombinedConfig, Scale, ScaleForm, UpToScale};
 use serde::Serialize;
 
+use super::sfm::reconstruct;
 use super::{Args, configured};
 use crate::engine::load_engine;
 use crate::output::{Output, StagedDir, percentiles};
@@ -40,7 +42,7 @@ pub fn run(
 ) -> Result<()> {
     let mut config: CombinedConfig = configured(args.config.as_deref())?;
     config.scale = args.scale.map_or(config.scale, super::ScaleBy::into);
-    let poses = poses_up_to_scale(args)?;
+    let poses = poses_up_to_scale(args, &source, output)?;
     let scale_form = config.scale;
     let engine = load_engine(&args.model, runtime, &args.engine)?;
     let engine_name = engine.name();
@@ -73,7 +75,7 @@ pub fn run(
     bar.finish_and_clear();
     if tracked == 0 {
         bail!(
-            "none of the times of --poses is that of a frame of {}\n  cure: give the trajectory.tum of a run over the same data",
+            "no frame of {} has a pose\n  cure: give --poses, the trajectory.tum of a run over the same data",
             args.data
         );
     }
@@ -122,18 +124,26 @@ pub fn run(
     output.result(&summary, &text)
 }
 
-fn poses_up_to_scale(args: &Args) -> Result<UpToScale> {
-    let Some(left) = &args.poses else {
-        bail!(
-            "--method combined puts clouds at the poses of another run, and --poses is not given\n  cure: --poses RUN/trajectory.tum of a run that knows rotations and directions, as structure from motion does"
-        );
+/// Those that are given, or those of structure from motion: of the frames that it placed.
+fn poses_up_to_scale(
+    args: &Args,
+    source: &Arc<dyn StereoSource>,
+    output: &Output,
+) -> Result<UpToScale> {
+    let right = (args.right_poses.as_deref())
+        .map(Trajectory::read_tum)
+        .transpose()?;
+    if let Some(left) = &args.poses {
+        let left = Trajectory::read_tum(left)?;
+        return Ok(UpToScale { left, right });
+    }
+    let result = reconstruct(source, SfmConfig::default(), output, None)?.result;
+    let poses = (result.trajectory_up_to_scale.poses.into_iter()).zip(result.tracked);
+    let placed = poses.filter_map(|(pose, tracked)| tracked.then_some(pose));
+    let left = Trajectory {
+        poses: placed.collect(),
     };
-    Ok(UpToScale {
-        left: Trajectory::read_tum(left)?,
-        right: (args.right_poses.as_deref())
-            .map(Trajectory::read_tum)
-            .transpose()?,
-    })
+    Ok(UpToScale { left, right })
 }
 
 fn describe(scale: &Scale) -> String {

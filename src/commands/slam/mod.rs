@@ -3,6 +3,7 @@
 mod combined;
 mod dead_reckoning;
 mod icp;
+mod sfm;
 mod stereo;
 
 use std::path::{Path, PathBuf};
@@ -12,6 +13,7 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::StereoSource;
 use barchan_geometry::Rig;
 use barchan_slam::ScaleForm;
+use barchan_slam::sfm::TrackKind;
 use clap::{Parser, ValueEnum};
 use serde::de::DeserializeOwned;
 
@@ -29,8 +31,9 @@ use crate::output::{Output, StagedDir};
     barchan slam --data tuesday/ --map runs/monday/map.safetensors --out runs/tuesday\n  \
     barchan slam --data images/ --no-loops --out runs/open     places seen before are not looked for\n  \
     barchan slam --data images/ --method icp --model sgm --out runs/icp        clouds brought onto each other\n  \
-    barchan slam --data images/ --method combined --poses sfm.tum --out runs/c  clouds at poses up to scale\n  \
-    barchan slam --data images/ --no-fusion --out runs/blind   IMU and wheels are not listened to")]
+    barchan slam --data images/ --method combined --out runs/c              clouds at the poses of structure from motion\n  \
+    barchan slam --data images/ --no-fusion --out runs/blind   IMU and wheels are not listened to\n  \
+    barchan slam --data images/ --method sfm --out runs/sfm    one camera and bundle adjustment; sparse points, no --model")]
 pub struct Args {
     /// A stereo sequence: PATH or FORMAT:PATH
     #[arg(long)]
@@ -77,8 +80,8 @@ pub struct Args {
     keyframe_ratio: Option<f64>,
     #[command(flatten)]
     engine: EngineSettings,
-    /// With --method combined: poses of the left cameras at the times of the frames, in any unit, as structure
-    /// from motion gives them: TUM text
+    /// With --method combined: poses of the left cameras at the times of the frames, in any unit, instead of
+    /// those of --method sfm: TUM text
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
     /// With --method combined: poses of the right cameras in the same unit, for the thesis's scale
@@ -87,12 +90,15 @@ pub struct Args {
     /// With --method combined: where the metre comes from (default corrected)
     #[arg(long, value_enum)]
     scale: Option<ScaleBy>,
+    /// How --method sfm follows things from image to image (default sift)
+    #[arg(long, value_enum)]
+    tracks: Option<Tracks>,
     #[command(flatten)]
     unchecked: Unchecked,
 }
 
 /// How the camera is followed.
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Method {
     /// Features in both images, a map of points, loops
     Stereo,
@@ -100,6 +106,8 @@ pub enum Method {
     Icp,
     /// Clouds at the poses of structure from motion (de Jong 2020, chapter 7)
     Combined,
+    /// Structure from motion by the left camera alone; the right one tells the metre
+    Sfm,
 }
 
 /// Where the metre of `--method combined` comes from.
@@ -120,6 +128,24 @@ impl From<ScaleBy> for ScaleForm {
     }
 }
 
+/// How `--method sfm` follows things from image to image.
+#[derive(Clone, Copy, ValueEnum)]
+enum Tracks {
+    /// Key points and descriptors
+    Sift,
+    /// Optical flow: more tracks, which last longer, but are lost when the camera jumps
+    Klt,
+}
+
+impl From<Tracks> for TrackKind {
+    fn from(tracks: Tracks) -> Self {
+        match tracks {
+            Tracks::Sift => Self::Sift,
+            Tracks::Klt => Self::Klt,
+        }
+    }
+}
+
 pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     refuse_strangers(&args)?;
     let source: Arc<dyn StereoSource> = open_checked(&args.data, &args.unchecked, output)?.into();
@@ -135,41 +161,35 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         Method::Stereo => stereo::run(&args, source, out, output, runtime),
         Method::Icp => icp::run(&args, source, out, output, runtime),
         Method::Combined => combined::run(&args, source, out, output, runtime),
+        Method::Sfm => sfm::run(&args, source, out, output),
     }
 }
 
 /// Refuses flags that the method would pass over in silence.
 fn refuse_strangers(args: &Args) -> Result<()> {
-    let (stereo, combined) = (
-        matches!(args.method, Method::Stereo),
-        matches!(args.method, Method::Combined),
-    );
-    let flags = [
-        ("--no-gate", args.no_gate, "stereo", stereo),
-        ("--no-loops", args.no_loops, "stereo", stereo),
-        ("--vocabulary", args.vocabulary.is_some(), "stereo", stereo),
-        ("--map", args.map.is_some(), "stereo", stereo),
-        ("--features", args.features.is_some(), "stereo", stereo),
-        ("--keypoints", args.keypoints.is_some(), "stereo", stereo),
-        (
-            "--keyframe-ratio",
-            args.keyframe_ratio.is_some(),
-            "stereo",
-            stereo,
-        ),
-        ("--poses", args.poses.is_some(), "combined", combined),
-        (
-            "--right-poses",
-            args.right_poses.is_some(),
-            "combined",
-            combined,
-        ),
-        ("--scale", args.scale.is_some(), "combined", combined),
+    use Method::{Combined, Sfm, Stereo};
+    let flags: [(&str, bool, &[Method]); 13] = [
+        ("--no-gate", args.no_gate, &[Stereo]),
+        ("--no-loops", args.no_loops, &[Stereo]),
+        ("--no-fusion", args.no_fusion, &[Stereo]),
+        ("--dead-reckoning", args.dead_reckoning.is_some(), &[Stereo]),
+        ("--vocabulary", args.vocabulary.is_some(), &[Stereo]),
+        ("--map", args.map.is_some(), &[Stereo]),
+        ("--features", args.features.is_some(), &[Stereo]),
+        ("--keypoints", args.keypoints.is_some(), &[Stereo, Sfm]),
+        ("--keyframe-ratio", args.keyframe_ratio.is_some(), &[Stereo]),
+        ("--tracks", args.tracks.is_some(), &[Sfm]),
+        ("--poses", args.poses.is_some(), &[Combined]),
+        ("--right-poses", args.right_poses.is_some(), &[Combined]),
+        ("--scale", args.scale.is_some(), &[Combined]),
     ];
-    for (flag, given, owner, asked) in flags {
-        if given && !asked {
+    for (flag, given, owners) in flags {
+        if given && !owners.contains(&args.method) {
+            let owners = owners.iter().filter_map(Method::to_possible_value);
+            let names: Vec<String> = owners.map(|v| v.get_name().to_owned()).collect();
             bail!(
-                "{flag} is of --method {owner}, and says nothing to the method that is asked for"
+                "{flag} is of --method {0}\n  cure: leave it out, or give --method {0}",
+                names.join(" or ")
             );
         }
     }
