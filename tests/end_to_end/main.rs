@@ -2,6 +2,7 @@
 
 mod adapt;
 mod bad_input;
+mod book;
 mod chain;
 mod data;
 mod fusion;
