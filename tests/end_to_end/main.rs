@@ -6,6 +6,7 @@ mod chain;
 mod data;
 mod help;
 mod program;
+mod serve;
 mod settings;
 mod smoke;
 mod survival;

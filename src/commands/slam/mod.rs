@@ -2,6 +2,8 @@
 
 mod stereo;
 
+pub use stereo::write_result;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
