@@ -4,6 +4,7 @@ mod adapt;
 mod bad_input;
 mod chain;
 mod data;
+mod faults;
 mod help;
 mod program;
 mod serve;
