@@ -14,10 +14,10 @@ static COUNTERS: Mutex<Vec<(usize, usize)>> = Mutex::new(Vec::new());
 #[unsafe(no_mangle)]
 unsafe extern "C" fn __sanitizer_cov_8bit_counters_init(start: *mut u8, stop: *mut u8) {
     let range = (start as usize, stop as usize - start as usize);
-    if let Ok(mut counters) = COUNTERS.lock() {
-        if !counters.contains(&range) {
-            counters.push(range);
-        }
+    if let Ok(mut counters) = COUNTERS.lock()
+        && !counters.contains(&range)
+    {
+        counters.push(range);
     }
 }
 
@@ -29,7 +29,6 @@ pub struct Coverage {
 
 impl Coverage {
     /// Looks at the counters since the last call, and clears them; whether there was something new.
-    #[allow(unsafe_code)]
     pub fn grew(&mut self) -> bool {
         let mut grew = false;
         let mut at = 0;
