@@ -29,7 +29,7 @@ TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/li
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data clean
+.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data fuzz faults dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -57,10 +57,34 @@ tch: onnxruntime libtorch ## the program with libtorch for train --device tch, a
 	cargo test $(CARGO_BUILD) --features tch --test end_to_end smoke::tch -- --nocapture
 	@echo "with libtorch: $(CARGO_TARGET_DIR)/release/barchan"
 
-lint: ## format, clippy and documentation, warnings denied
+lint: ## format, clippy, documentation and licences, warnings denied
 	cargo fmt --all --check
 	cargo clippy $(CARGO_BUILD) --all-targets -- -D warnings
+	$(PYTHON) scripts/licences.py > /dev/null
 	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_BUILD) --no-deps
+
+# The compiler counts the ways taken through the program, in a build folder of its own. Without the
+# network library that takes some minutes. --target keeps build scripts out of it.
+FUZZ_SECONDS = 60
+# In memory, where there is such a folder: every damaged file is written.
+FUZZ_TMP     = $(or $(wildcard /dev/shm),/tmp)
+FUZZ_FLAGS   = -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=3 \
+	-Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Ccodegen-units=1 -Clink-arg=-Wl,-z,nostart-stop-gc
+FUZZ_HOST    = $(shell rustc -vV | sed -n 's/^host: //p')
+fuzz: export CARGO_TARGET_DIR := $(CARGO_TARGET_DIR)-fuzz
+fuzz: export RUSTFLAGS := $(FUZZ_FLAGS)
+fuzz: ## damaged files for every reader, FUZZ_SECONDS=60 each; what breaks one is left in fuzz/crashes
+	cargo build --release -p barchan-fuzz --target $(FUZZ_HOST) $(CARGO_FLAGS)
+	@program=$(CARGO_TARGET_DIR)/$(FUZZ_HOST)/release/barchan-fuzz; failed=0; \
+	for reader in $$($$program list); do TMPDIR=$(FUZZ_TMP) $$program $$reader $(FUZZ_SECONDS) || failed=1; done; exit $$failed
+
+KILLS = 50
+faults: ## KILLS=50 ends of train, slam and map at random moments: what was finished is whole
+	BARCHAN_KILLS=$(KILLS) cargo test $(CARGO_BUILD) --test end_to_end faults:: survival::killed -- --nocapture
+
+dist: ## the program without symbols and the licences of its crates, for packages (compiles the network library again)
+	cargo build --profile dist $(CARGO_FLAGS)
+	$(PYTHON) scripts/licences.py > $(CARGO_TARGET_DIR)/dist/LICENCES.txt
 
 bench: onnxruntime ## timings of the main job, step by step
 	cargo bench --workspace --bench main_job $(CARGO_FLAGS)

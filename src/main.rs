@@ -49,6 +49,7 @@ enum Command {
     Map(commands::map::Args),
     Raster(commands::raster::Args),
     Report(commands::report::Args),
+    Serve(commands::serve::Args),
     Eval(commands::eval::Args),
     Compare(commands::compare::Args),
     Data(commands::data::Args),
@@ -80,6 +81,7 @@ fn main() -> ExitCode {
         Command::Map(args) => commands::map::run(args, &output),
         Command::Raster(args) => commands::raster::run(args, &output),
         Command::Report(args) => commands::report::run(args, &output),
+        Command::Serve(args) => commands::serve::run(args, &output, runtime),
         Command::Eval(args) => commands::eval::run(args, &output, runtime),
         Command::Compare(args) => commands::compare::run(args, &output, runtime),
         Command::Data(args) => match commands::data::run(args, &output) {

@@ -99,12 +99,15 @@ impl StagedDir {
                 target.display()
             );
         }
-        let mut stage = target.components().as_path().as_os_str().to_owned();
-        stage.push(".part");
         let staged = Self {
-            stage: stage.into(),
+            stage: beside(target, ".part"),
             target: target.to_owned(),
         };
+        // A run that was ended between the two names of `finish`: what was there before is back.
+        let old = beside(target, ".barchan-old");
+        if !target.exists() && old.join(mark).is_file() {
+            std::fs::rename(&old, target).with_context(|| old.display().to_string())?;
+        }
         if staged.stage.exists() {
             std::fs::remove_dir_all(&staged.stage)
                 .with_context(|| staged.stage.display().to_string())?;
@@ -137,11 +140,29 @@ impl StagedDir {
     /// Gives the directory its name.
     pub fn finish(self) -> Result<()> {
         let context = || self.target.display().to_string();
-        if self.target.exists() {
-            std::fs::remove_dir_all(&self.target).with_context(context)?;
+        // To remove what was there takes a while, in which the end of the process would lose both.
+        let old = beside(&self.target, ".barchan-old");
+        if old.exists() {
+            std::fs::remove_dir_all(&old).with_context(|| old.display().to_string())?;
         }
-        std::fs::rename(&self.stage, &self.target).with_context(context)
+        if self.target.exists() {
+            std::fs::rename(&self.target, &old).with_context(context)?;
+        }
+        std::fs::rename(&self.stage, &self.target).with_context(context)?;
+        match std::fs::remove_dir_all(&old) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(e).with_context(|| old.display().to_string())
+            }
+            _ => Ok(()),
+        }
     }
+}
+
+/// The path with `ending` after its last name.
+fn beside(path: &Path, ending: &str) -> PathBuf {
+    let mut name = path.components().as_path().as_os_str().to_owned();
+    name.push(ending);
+    name.into()
 }
 
 impl Drop for StagedDir {

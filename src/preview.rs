@@ -34,6 +34,14 @@ fn disparity_colour(disparity: f32, (low, high): (f32, f32)) -> image::Rgb<u8> {
     }
 }
 
+/// 0..=1 as an 8-bit grey image.
+pub fn share(share: &Plane) -> image::GrayImage {
+    let (width, height) = share.dimensions();
+    image::GrayImage::from_fn(width, height, |x, y| {
+        image::Luma([(share.get_pixel(x, y).0[0].clamp(0.0, 1.0) * 255.0).round() as u8])
+    })
+}
+
 /// Left image, right image and true disparity (black where unknown) of each pair, a pair a row.
 pub fn contact_sheet(pairs: &[(StereoFrame, Option<Plane>)]) -> RgbImage {
     /// Width of one picture, pixels.

@@ -56,6 +56,18 @@ fn read_png(path: &Path) -> Result<Plane, DataError> {
 /// # Errors
 /// When the file cannot be written.
 pub fn write_png(path: &Path, disparity: &Plane) -> Result<(), DataError> {
+    write_whole(path, &encode_png(path, &as_png(disparity))?)
+}
+
+/// The bytes of the file that [`write_png`] writes; `name` is for messages.
+///
+/// # Errors
+/// When the image has no pixels.
+pub fn png_bytes(name: &Path, disparity: &Plane) -> Result<Vec<u8>, DataError> {
+    encode_png(name, &as_png(disparity))
+}
+
+fn as_png(disparity: &Plane) -> DynamicImage {
     // A known disparity never becomes 0, which would read back as not known.
     let store = |d: &f32| {
         if *d >= 0.0 {
@@ -69,7 +81,7 @@ pub fn write_png(path: &Path, disparity: &Plane) -> Result<(), DataError> {
     // One value a pixel by construction.
     let stored: ImageBuffer<Luma<u16>, _> =
         ImageBuffer::from_raw(width, height, values).unwrap_or_default();
-    write_whole(path, &encode_png(path, &stored.into())?)
+    stored.into()
 }
 
 /// Writes a little-endian grey PFM, `inf` where not known. Whole or not at all.
@@ -77,6 +89,11 @@ pub fn write_png(path: &Path, disparity: &Plane) -> Result<(), DataError> {
 /// # Errors
 /// When the file cannot be written.
 pub fn write_pfm(path: &Path, disparity: &Plane) -> Result<(), DataError> {
+    write_whole(path, &pfm_bytes(disparity))
+}
+
+/// The bytes of the file that [`write_pfm`] writes.
+pub fn pfm_bytes(disparity: &Plane) -> Vec<u8> {
     let (width, height) = disparity.dimensions();
     let mut bytes = format!("Pf\n{width} {height}\n-1.0\n").into_bytes();
     for row in disparity.as_raw().chunks_exact(width.max(1) as usize).rev() {
@@ -84,7 +101,7 @@ pub fn write_pfm(path: &Path, disparity: &Plane) -> Result<(), DataError> {
             bytes.extend_from_slice(&if d.is_finite() { *d } else { f32::INFINITY }.to_le_bytes());
         }
     }
-    write_whole(path, &bytes)
+    bytes
 }
 
 /// The grey PFM format: `Pf`, width, height, scale (negative: little endian), one white space,

@@ -1,6 +1,7 @@
+use std::io::Cursor;
 use std::path::Path;
 
-use image::{DynamicImage, ImageFormat};
+use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 
 use crate::{DataError, Rgb};
 
@@ -13,44 +14,80 @@ pub fn read_rgb(path: &Path) -> Result<Rgb, DataError> {
     decode(path).map(|image| image.into_rgb32f())
 }
 
+/// [`read_rgb`] of bytes that are in memory already; `name` is for messages.
+///
+/// # Errors
+/// As [`read_rgb`].
+pub fn parse_rgb(bytes: &[u8], name: &Path) -> Result<Rgb, DataError> {
+    decode_bytes(bytes, name).map(|image| image.into_rgb32f())
+}
+
+/// Width and height of an image in memory, from its header; `name` is for messages.
+///
+/// # Errors
+/// When the bytes are no image that [`read_rgb`] reads.
+pub fn parse_size(bytes: &[u8], name: &Path) -> Result<(u32, u32), DataError> {
+    let reader = ImageReader::with_format(Cursor::new(bytes), format_of(bytes, name)?);
+    reader.into_dimensions().map_err(broken(name))
+}
+
+/// Most pixels of an image that is read: as `f32` in three channels they take half a gigabyte. A few
+/// bytes may claim any size.
+const MAX_PIXELS: u64 = 40_000_000;
+
 /// Width and height of an image, from its header.
 pub(crate) fn image_size(path: &Path) -> Result<(u32, u32), DataError> {
-    let reader = image::ImageReader::open(path)
-        .and_then(image::ImageReader::with_guessed_format)
+    let reader = ImageReader::open(path)
+        .and_then(ImageReader::with_guessed_format)
         .map_err(DataError::io(path))?;
-    reader.into_dimensions().map_err(|error| {
-        DataError::file(
-            path,
-            format!("truncated or corrupt ({error}); copy it again from its origin"),
-        )
-    })
+    reader.into_dimensions().map_err(broken(path))
 }
 
 /// Reads an image as its file holds it.
 pub(crate) fn decode(path: &Path) -> Result<DynamicImage, DataError> {
-    let bytes = std::fs::read(path).map_err(DataError::io(path))?;
+    decode_bytes(&std::fs::read(path).map_err(DataError::io(path))?, path)
+}
+
+fn decode_bytes(bytes: &[u8], path: &Path) -> Result<DynamicImage, DataError> {
+    let format = format_of(bytes, path)?;
+    // The JPEG decoder fills the missing part of a truncated file with grey and says nothing.
+    if format == ImageFormat::Jpeg && !jpeg_is_complete(bytes) {
+        return Err(DataError::file(
+            path,
+            "the JPEG is truncated; copy it again from its origin",
+        ));
+    }
+    let (width, height) = parse_size(bytes, path)?;
+    if u64::from(width) * u64::from(height) > MAX_PIXELS {
+        return Err(DataError::file(
+            path,
+            format!(
+                "{width} x {height} pixels, and at most {MAX_PIXELS} are read; make it smaller, and its calibration with it"
+            ),
+        ));
+    }
+    let reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.decode().map_err(broken(path))
+}
+
+fn format_of(bytes: &[u8], path: &Path) -> Result<ImageFormat, DataError> {
     if bytes.is_empty() {
         return Err(DataError::file(
             path,
             "the file is empty; copy it again from its origin",
         ));
     }
-    let format = image::guess_format(&bytes).map_err(|_| {
-        DataError::file(path, "not an image; PNG, JPEG, TIFF, PPM and PGM are read")
-    })?;
-    // The JPEG decoder fills the missing part of a truncated file with grey and says nothing.
-    if format == ImageFormat::Jpeg && !jpeg_is_complete(&bytes) {
-        return Err(DataError::file(
-            path,
-            "the JPEG is truncated; copy it again from its origin",
-        ));
-    }
-    image::load_from_memory_with_format(&bytes, format).map_err(|error| {
+    image::guess_format(bytes)
+        .map_err(|_| DataError::file(path, "not an image; PNG, JPEG, TIFF, PPM and PGM are read"))
+}
+
+fn broken(path: &Path) -> impl Fn(ImageError) -> DataError {
+    move |error| {
         DataError::file(
             path,
             format!("truncated or corrupt ({error}); copy it again from its origin"),
         )
-    })
+    }
 }
 
 /// Whether an end-of-image marker follows the last start of scan. Neither occurs inside
@@ -79,7 +116,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
 
 /// The bytes of an image as a PNG.
 pub(crate) fn encode_png(path: &Path, image: &DynamicImage) -> Result<Vec<u8>, DataError> {
-    let mut bytes = std::io::Cursor::new(Vec::new());
+    let mut bytes = Cursor::new(Vec::new());
     image
         .write_to(&mut bytes, ImageFormat::Png)
         .map_err(|error| DataError::file(path, format!("cannot be encoded: {error}")))?;

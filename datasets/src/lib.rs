@@ -34,7 +34,7 @@ pub use calibration::load_rig;
 pub use correction::{Corrected, Correction};
 pub use error::DataError;
 pub use formats::folder::Folder;
-pub use image_file::{read_rgb, write_whole};
+pub use image_file::{parse_rgb, parse_size, read_rgb, write_whole};
 pub use open::{dataset_folder, open, open_as_stored};
 pub use pairs::PairSource;
 pub use prefetch::{Prefetch, prefetch, prefetch_with};

@@ -56,6 +56,15 @@ impl Trajectory {
         let mut poses = Vec::with_capacity(rows.len());
         for (i, (line, r)) in rows.into_iter().enumerate() {
             let matrix = Matrix3::from_fn(|a, b| r[4 * a + b]);
+            // Far from a rotation the search for the nearest need not end.
+            let off = (matrix * matrix.transpose() - Matrix3::identity()).norm();
+            if off.is_nan() || off > 0.1 || matrix.determinant() < 0.0 {
+                return Err(GeometryError::Trajectory {
+                    path: path.to_owned(),
+                    line,
+                    message: "the left three columns are no rotation".into(),
+                });
+            }
             // Published poses are printed with few digits: take the nearest rotation.
             let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&matrix));
             let pose = Se3::from_parts(Translation3::new(r[3], r[7], r[11]), rotation);
@@ -209,5 +218,20 @@ mod tests {
         std::fs::write(&path, "# comment\n0 0 0 0 0 0 0 1\n1 2 3\n").unwrap();
         let message = Trajectory::read_tum(&path).unwrap_err().to_string();
         assert!(message.contains("bad.tum:3"), "{message}");
+    }
+
+    #[test]
+    fn a_matrix_that_is_no_rotation_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.kitti");
+        for row in [
+            "0 0 0 0 0 0 0 0 0 0 0 0",
+            "1e308 0 0 0 0 1 0 0 0 0 1 0",
+            "1 0 0 0 0 1 0 0 0 0 -1 0",
+        ] {
+            std::fs::write(&path, format!("1 0 0 0 0 1 0 0 0 0 1 0\n{row}\n")).unwrap();
+            let message = Trajectory::read_kitti(&path, None).unwrap_err().to_string();
+            assert!(message.contains("no rotation"), "{row}: {message}");
+        }
     }
 }

@@ -116,7 +116,7 @@ pub fn from_bytes(bytes: &[u8], name: &Path, device: &Device) -> Result<StereoNe
 /// Writes to a neighbour, then renames: a reader sees the old file or the new one.
 ///
 /// # Errors
-/// When either step fails.
+/// When either step fails; nothing is left then.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
     let failed = |source| ModelError::Io {
         path: path.to_owned(),
@@ -124,8 +124,13 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
     };
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
-    std::fs::write(&part, bytes).map_err(failed)?;
-    std::fs::rename(&part, path).map_err(failed)
+    std::fs::write(&part, bytes)
+        .and_then(|()| std::fs::rename(&part, path))
+        .map_err(|error| {
+            // Best effort: the first error is the one to tell.
+            let _ = std::fs::remove_file(&part);
+            failed(error)
+        })
 }
 
 /// Burn names the variant of an enum too, as Rust does, in capitals; a file's names should not change with it.

@@ -262,17 +262,25 @@ impl Slam {
         Ok(report)
     }
 
-    /// Every frame through: poses of all frames, following their corrected key frames.
+    /// Time and pose of the newest frame as they are known now; of a lost one, as predicted. `None` before
+    /// the first.
+    pub fn pose(&self) -> Option<StampedPose> {
+        self.placed.last().map(|p| self.stamped(p))
+    }
+
+    /// The pose of a frame, following its key frame as that is now.
     #[allow(non_snake_case)]
+    fn stamped(&self, placed: &Placed) -> StampedPose {
+        let keyframe = self.map.keyframes.get(placed.keyframe);
+        let T_keyframe_world = keyframe.map(|k| k.T_cam_world).unwrap_or_default();
+        StampedPose {
+            time: placed.time,
+            T_world_cam: (placed.T_cam_keyframe * T_keyframe_world).inverse(),
+        }
+    }
+
+    /// Every frame through: poses of all frames, following their corrected key frames.
     pub fn finish(self) -> SlamResult {
-        let T_world_cam = |p: &Placed| {
-            let T_keyframe_world = self.map.keyframes.get(p.keyframe).map(|k| k.T_cam_world);
-            (p.T_cam_keyframe * T_keyframe_world.unwrap_or_default()).inverse()
-        };
-        let stamped = |p: &Placed| StampedPose {
-            time: p.time,
-            T_world_cam: T_world_cam(p),
-        };
         let keyframe = |k: &Keyframe| {
             let pose = StampedPose {
                 time: k.time,
@@ -286,7 +294,7 @@ impl Slam {
             covariances: pose_covariances(&self.map, loops, &self.rig, &self.config)
                 .map(|all| all[self.known..].to_vec()),
             trajectory: Trajectory {
-                poses: self.placed.iter().map(stamped).collect(),
+                poses: self.placed.iter().map(|p| self.stamped(p)).collect(),
             },
             keyframes: new.iter().map(keyframe).collect(),
             submaps: new.iter().map(|k| k.submap).collect(),

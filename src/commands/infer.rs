@@ -3,9 +3,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{
-    Plane, StereoFrame, StereoSource, disparity_file, load_rig, prefetch, read_rgb,
-};
+use barchan_datasets::{StereoFrame, StereoSource, disparity_file, load_rig, prefetch, read_rgb};
 use barchan_geometry::RectifiedRig;
 use barchan_infer::Rejection;
 use barchan_terrain::{Cloud, DepthLimits};
@@ -15,7 +13,7 @@ use serde::Serialize;
 use crate::data::{Unchecked, open_checked};
 use crate::engine::{EngineSettings, load_engine};
 use crate::output::{Output, StagedDir, percentiles};
-use crate::preview::{disparity_beside_image, disparity_range};
+use crate::preview::{disparity_beside_image, disparity_range, share};
 
 /// Disparity, confidence, a colour preview and a cloud of points for every pair
 #[derive(Parser)]
@@ -99,10 +97,10 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         let name = &frame.name;
         disparity_file::write_png(&out.path(format!("disparity/{name}.png"))?, &map.disparity)?;
         disparity_file::write_pfm(&out.path(format!("disparity/{name}.pfm"))?, &map.disparity)?;
-        write_share(
-            &map.confidence,
-            &out.path(format!("confidence/{name}.png"))?,
-        )?;
+        let confidence = out.path(format!("confidence/{name}.png"))?;
+        share(&map.confidence)
+            .save(&confidence)
+            .with_context(|| confidence.display().to_string())?;
         // The full precision, for those who rank pixels by it.
         for (what, plane) in [("confidence", &map.confidence), ("sigma", &map.sigma)] {
             disparity_file::write_pfm(&out.path(format!("{what}/{name}.pfm"))?, plane)?;
@@ -224,14 +222,4 @@ fn select(source: &dyn StereoSource, list: &Path) -> Result<Vec<usize>> {
             })
         })
         .collect()
-}
-
-/// 0..=1 as an 8-bit grey image.
-fn write_share(share: &Plane, path: &Path) -> Result<()> {
-    let (width, height) = share.dimensions();
-    image::GrayImage::from_fn(width, height, |x, y| {
-        image::Luma([(share.get_pixel(x, y).0[0].clamp(0.0, 1.0) * 255.0).round() as u8])
-    })
-    .save(path)
-    .with_context(|| path.display().to_string())
 }

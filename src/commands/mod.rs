@@ -14,6 +14,7 @@ pub mod map;
 pub mod probe;
 pub mod raster;
 pub mod report;
+pub mod serve;
 pub mod slam;
 pub mod train;
 pub mod vocabulary;

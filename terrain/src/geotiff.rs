@@ -1,5 +1,5 @@
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufReader, Cursor, Seek, Write};
 use std::path::Path;
 
 use tiff::decoder::{Decoder, DecodingResult};
@@ -174,6 +174,37 @@ pub fn write_geotiff<T: Sample>(
 where
     [T]: TiffValue,
 {
+    write_atomically(path, |out| encode(path, out, grid, crs, bands))
+}
+
+/// The bytes of the file that [`write_geotiff`] writes.
+///
+/// # Errors
+/// When a band has not the size of the grid.
+pub fn geotiff_bytes<T: Sample>(
+    grid: &Grid,
+    crs: Option<&Crs>,
+    bands: &[(&str, &[T])],
+) -> Result<Vec<u8>, TerrainError>
+where
+    [T]: TiffValue,
+{
+    let mut bytes = Cursor::new(vec![]);
+    encode(Path::new("raster"), &mut bytes, grid, crs, bands)?;
+    Ok(bytes.into_inner())
+}
+
+/// `path` is for messages.
+fn encode<T: Sample>(
+    path: &Path,
+    out: impl Write + Seek,
+    grid: &Grid,
+    crs: Option<&Crs>,
+    bands: &[(&str, &[T])],
+) -> Result<(), TerrainError>
+where
+    [T]: TiffValue,
+{
     let bad = |message: String| TerrainError::Raster {
         path: path.to_owned(),
         message,
@@ -194,44 +225,42 @@ where
         .collect();
     let local = Crs::local();
     let crs = crs.unwrap_or(&local);
-    write_atomically(path, |out| {
-        let write = || -> TiffResult<()> {
-            let mut tiff = TiffEncoder::new(out)?
-                .with_compression(Compression::Deflate(DeflateLevel::Balanced));
-            let mut image = tiff.new_image::<T::Stored>(width, height)?;
-            if bands.len() > 1 {
-                image.extra_samples(&vec![ExtraSamples::Unspecified; bands.len() - 1])?;
-            }
-            let tags = image.encoder();
-            tags.write_tag(
-                Tag::ModelPixelScaleTag,
-                &[grid.cell_x, grid.cell_y, 0.0][..],
-            )?;
-            tags.write_tag(
-                Tag::ModelTiepointTag,
-                &[0.0, 0.0, 0.0, grid.west, grid.north, 0.0][..],
-            )?;
-            tags.write_tag(Tag::GeoKeyDirectoryTag, &crs.directory()[..])?;
-            if !crs.doubles.is_empty() {
-                tags.write_tag(Tag::GeoDoubleParamsTag, &crs.doubles[..])?;
-            }
-            if !crs.ascii.is_empty() {
-                tags.write_tag(Tag::GeoAsciiParamsTag, crs.ascii.as_str())?;
-            }
-            let names = band_names(bands.iter().map(|b| b.0));
-            if !names.is_empty() {
-                tags.write_tag(GDAL_METADATA, names.as_str())?;
-            }
-            tags.write_tag(Tag::GdalNodata, T::NODATA)?;
-            image.write_data(&interleaved)
-        };
-        write().map_err(|e| match e {
-            TiffError::IoError(source) => TerrainError::Io {
-                path: path.to_owned(),
-                source,
-            },
-            other => bad(other.to_string()),
-        })
+    let write = || -> TiffResult<()> {
+        let mut tiff =
+            TiffEncoder::new(out)?.with_compression(Compression::Deflate(DeflateLevel::Balanced));
+        let mut image = tiff.new_image::<T::Stored>(width, height)?;
+        if bands.len() > 1 {
+            image.extra_samples(&vec![ExtraSamples::Unspecified; bands.len() - 1])?;
+        }
+        let tags = image.encoder();
+        tags.write_tag(
+            Tag::ModelPixelScaleTag,
+            &[grid.cell_x, grid.cell_y, 0.0][..],
+        )?;
+        tags.write_tag(
+            Tag::ModelTiepointTag,
+            &[0.0, 0.0, 0.0, grid.west, grid.north, 0.0][..],
+        )?;
+        tags.write_tag(Tag::GeoKeyDirectoryTag, &crs.directory()[..])?;
+        if !crs.doubles.is_empty() {
+            tags.write_tag(Tag::GeoDoubleParamsTag, &crs.doubles[..])?;
+        }
+        if !crs.ascii.is_empty() {
+            tags.write_tag(Tag::GeoAsciiParamsTag, crs.ascii.as_str())?;
+        }
+        let names = band_names(bands.iter().map(|b| b.0));
+        if !names.is_empty() {
+            tags.write_tag(GDAL_METADATA, names.as_str())?;
+        }
+        tags.write_tag(Tag::GdalNodata, T::NODATA)?;
+        image.write_data(&interleaved)
+    };
+    write().map_err(|e| match e {
+        TiffError::IoError(source) => TerrainError::Io {
+            path: path.to_owned(),
+            source,
+        },
+        other => bad(other.to_string()),
     })
 }
 

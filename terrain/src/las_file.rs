@@ -178,6 +178,11 @@ impl Cloud {
                 laszip = Some(content);
             }
         }
+        let length = file.metadata().map_err(TerrainError::io(path))?.len();
+        // The decompressor would make room for as many as the file claims. A chunk begins with a whole point.
+        if compressed && chunks(&mut file, start).map_err(io)? > length / size as u64 {
+            return Err(bad("it claims more chunks than it has bytes for"));
+        }
         file.seek(SeekFrom::Start(start)).map_err(io)?;
         let source = BufReader::with_capacity(1 << 20, file);
         let mut source = match (compressed, laszip) {
@@ -235,6 +240,27 @@ fn file_error(path: &Path, message: String) -> TerrainError {
         path: path.to_owned(),
         message,
     }
+}
+
+/// How many chunks a compressed file claims to have: beside their table, whose place stands before the points,
+/// or at the end of the file where a writer could not go back. 0 where there is no table.
+fn chunks(file: &mut File, start: u64) -> std::io::Result<u64> {
+    let mut place = [0; 8];
+    file.seek(SeekFrom::Start(start))?;
+    file.read_exact(&mut place)?;
+    if i64::from_le_bytes(place) <= start as i64 {
+        file.seek(SeekFrom::End(-8))?;
+        file.read_exact(&mut place)?;
+    }
+    let table = i64::from_le_bytes(place);
+    if table <= start as i64 {
+        return Ok(0);
+    }
+    // A version stands first.
+    file.seek(SeekFrom::Start(table as u64 + 4))?;
+    let mut count = [0; 4];
+    file.read_exact(&mut count)?;
+    Ok(u64::from(u32::from_le_bytes(count)))
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ pub use cloud::{Cloud, CloudPoint, DepthLimits};
 pub use earthwork::{Earthwork, earthwork};
 pub use error::TerrainError;
 pub use fill::{Filled, MAX_FILL, fill};
-pub use geotiff::{Crs, Sample, write_geotiff};
+pub use geotiff::{Crs, Sample, geotiff_bytes, write_geotiff};
 pub use hillshade::{Light, hillshade};
 pub use level::{Levelled, level};
 pub use map::{

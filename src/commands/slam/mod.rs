@@ -6,6 +6,8 @@ mod icp;
 mod sfm;
 mod stereo;
 
+pub use stereo::write_result;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -233,7 +233,8 @@ fn read_map(file: &Path, rig: &RectifiedRig, detector: Detector) -> Result<Map> 
     Ok(map)
 }
 
-fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
+/// Poses, key frames and the points of the map.
+pub fn write_result(out: &StagedDir, result: &SlamResult) -> Result<()> {
     let keyframes: Vec<_> = (result.keyframes.iter().zip(&result.submaps).enumerate())
         .map(|(k, ((frame, name, pose), submap))| RunKeyframe {
             frame: *frame,
