@@ -28,15 +28,6 @@ pub struct EngineSettings {
     pub outlines: usize,
 }
 
-impl Default for EngineSettings {
-    fn default() -> Self {
-        Self {
-            threads: 0,
-            outlines: Outlines::default().passes,
-        }
-    }
-}
-
 /// The network of a shipped name, a safetensors file, or a run directory of `barchan train`; with
 /// `:192` after it, searching 192 disparities.
 pub fn load_net(model: &str, device: &Device) -> Result<StereoNet> {

@@ -19,6 +19,7 @@ use self::maps::{Ground, from_above};
 use crate::commands::eval::read_trajectory;
 use crate::commands::slam::{self, Method};
 use crate::data::{Unchecked, open_checked};
+use crate::engine::EngineSettings;
 use crate::output::{Output, StagedDir};
 
 /// Compare methods and disparity engines on one sequence: a table, routes, maps, disparities
@@ -41,7 +42,7 @@ pub struct Args {
     /// A run of `barchan slam` over the same data that takes part as it is; may be given several times
     #[arg(long = "run", value_name = "NAME=DIR")]
     runs: Vec<String>,
-    /// Poses up to scale for the combined method: TUM text [default: those of a run named sfm]
+    /// Poses up to scale for the combined method: TUM text [default: those of a run named sfm, else of structure from motion]
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
     /// The true trajectory, where the data has none: .tum, KITTI text or gt.csv
@@ -50,6 +51,8 @@ pub struct Args {
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    #[command(flatten)]
+    engine: EngineSettings,
     #[command(flatten)]
     unchecked: Unchecked,
 }
@@ -115,7 +118,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
 
     // Runs first: each leaves a folder, whatever its method, and all else is read from there.
     let mut rows = given;
-    for (name, words) in planned(&args, &rows, output) {
+    for (name, words) in planned(&args, &rows) {
         let folder = out.path(format!("runs/{name}"))?;
         output.say(&format!("{name} ..."));
         let mut row = Row {
@@ -149,7 +152,8 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let true_route = truth.as_ref().map(|t| ground.route(t, &Se3::identity()));
     pictures::routes(&out, &compared, true_route)?;
     pictures::maps(&out, &compared, ground.truth(), truth.as_ref())?;
-    pictures::disparities(&out, source.as_ref(), &args.models, runtime)?;
+    let engines = (&args.models[..], &args.engine);
+    pictures::disparities(&out, source.as_ref(), engines, runtime)?;
     let comparison = Comparison {
         data: &args.data,
         length: truth.as_ref().map(|t| path_length(&positions(t))),
@@ -193,7 +197,7 @@ fn given_runs(args: &Args) -> Result<Vec<(Row, PathBuf)>> {
 }
 
 /// Names of the runs to be made, and what `barchan slam` is told for each besides where to write it.
-fn planned(args: &Args, given: &[(Row, PathBuf)], output: &Output) -> Vec<(String, Vec<String>)> {
+fn planned(args: &Args, given: &[(Row, PathBuf)]) -> Vec<(String, Vec<String>)> {
     let of_sfm = given.iter().find(|(row, _)| row.name == "sfm");
     let poses =
         (args.poses.clone()).or_else(|| of_sfm.map(|(_, folder)| folder.join("trajectory.tum")));
@@ -216,20 +220,25 @@ fn planned(args: &Args, given: &[(Row, PathBuf)], output: &Output) -> Vec<(Strin
             ]
             .map(str::to_owned)
             .to_vec();
+            words.extend(["--threads".into(), args.engine.threads.to_string()]);
+            words.extend(["--outlines".into(), args.engine.outlines.to_string()]);
             if args.unchecked.no_check {
                 words.push("--no-check".into());
             }
             if let Method::Combined = method {
-                let Some(poses) = &poses else {
-                    output.notice(
-                        "the combined method is left out: it needs --poses, or --run sfm=DIR",
-                    );
-                    break;
-                };
-                words.extend(["--poses".into(), poses.display().to_string()]);
+                // Without, it makes its own.
+                if let Some(poses) = &poses {
+                    words.extend(["--poses".into(), poses.display().to_string()]);
+                }
             }
             let engine = Path::new(model).file_stem().unwrap_or_default();
             let name = format!("{method_name}-{}", engine.to_string_lossy()).replace(':', "-");
+            let one_camera = *method == Method::Sfm;
+            let name = if one_camera {
+                method_name.to_owned()
+            } else {
+                name
+            };
             let taken = |name: &str| {
                 given.iter().any(|(row, _)| row.name == name)
                     || runs.iter().any(|(other, _)| other == name)
@@ -239,6 +248,9 @@ fn planned(args: &Args, given: &[(Row, PathBuf)], output: &Output) -> Vec<(Strin
                 .chain(numbered)
                 .find(|n| !taken(n));
             runs.extend(free.map(|name| (name, words)));
+            if one_camera {
+                break;
+            }
         }
     }
     runs

@@ -174,13 +174,13 @@ const FRAMES: usize = 4;
 pub fn disparities(
     out: &StagedDir,
     source: &dyn StereoSource,
-    models: &[String],
+    (models, settings): (&[String], &EngineSettings),
     runtime: Option<&Path>,
 ) -> Result<()> {
     let mut engines = vec![];
     for model in models {
         // One that cannot be had has already failed as a run.
-        if let Ok(engine) = load_engine(model, runtime, &EngineSettings::default()) {
+        if let Ok(engine) = load_engine(model, runtime, settings) {
             engines.push((model, engine));
         }
     }

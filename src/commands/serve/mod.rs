@@ -22,7 +22,7 @@ use serde_json::json;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
-use crate::engine::load_engine;
+use crate::engine::{EngineSettings, load_engine};
 use crate::output::Output;
 use crate::preview::share;
 use http::{Connection, Head, NoRequest, Response};
@@ -86,6 +86,9 @@ pub struct Args {
     /// Threads that work on one image; 0 leaves it to the engine
     #[arg(long)]
     threads: Option<usize>,
+    /// How often the outlines of a network's disparity are moved to where the images have them [default: 2]
+    #[arg(long, value_name = "PASSES")]
+    outlines: Option<usize>,
     /// Edge of a voxel of the map, metres [default: 0.02]
     #[arg(long, value_name = "M")]
     voxel: Option<f64>,
@@ -115,6 +118,7 @@ impl Args {
         s.keep_answers = self.keep_answers.unwrap_or(s.keep_answers);
         s.track &= !self.no_track;
         s.threads = self.threads.unwrap_or(s.threads);
+        s.outlines = self.outlines.unwrap_or(s.outlines);
         s.voxel = self.voxel.unwrap_or(s.voxel);
         s.cell = self.cell.unwrap_or(s.cell);
         s.check()?;
@@ -132,7 +136,11 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             settings.rig.display()
         )
     })?;
-    let engine = load_engine(&settings.model, runtime, settings.threads)?;
+    let engines = EngineSettings {
+        threads: settings.threads,
+        outlines: settings.outlines,
+    };
+    let engine = load_engine(&settings.model, runtime, &engines)?;
     let name = engine.name();
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use barchan_infer::Outlines;
 use barchan_slam::SlamConfig;
 use serde::{Deserialize, Serialize};
 
@@ -41,6 +42,8 @@ pub struct Settings {
     pub track: bool,
     /// Threads of the disparity engine; 0 leaves it to the engine.
     pub threads: usize,
+    /// How often outlines of a network's disparity are sharpened.
+    pub outlines: usize,
     /// Edge of a voxel of the map, metres.
     pub voxel: f64,
     /// Edge of a cell of the map's tiles, metres.
@@ -67,6 +70,7 @@ impl Default for Settings {
             keep_answers: 16,
             track: true,
             threads: 0,
+            outlines: Outlines::default().passes,
             voxel: 0.02,
             cell: 0.05,
             slam: SlamConfig::default(),
