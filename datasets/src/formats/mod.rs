@@ -3,7 +3,7 @@
 
 mod euroc;
 pub(crate) mod folder;
-mod katwijk;
+pub(crate) mod katwijk;
 mod kitti_odometry;
 mod kitti_stereo;
 mod middlebury;

@@ -11,6 +11,7 @@ use crate::listing::{Named, list};
 use crate::pairs::{Calibrated, Pair, PairSource};
 use crate::{DataError, GnssFix, ImuSample, OdometrySample, Sensors};
 use tables::{Fix, WHEELS, Wheels, read_fixes, read_imu, read_wheels, stamp};
+pub(crate) use tables::{ZONE, to_utm31};
 
 /// Katwijk beach (ESA 2015): a part of a traverse with the images of the localisation camera in
 /// `LocCam/` or beside the text files, as `LocCam_YYYY_MM_DD_hh_mm_ss_mmm_{0,1}.png`, 0 the left one.

@@ -12,7 +12,7 @@ use crate::{DataError, ImuSample};
 pub(super) const WHEELS: usize = 6;
 
 /// The UTM zone of the beach.
-const ZONE: u8 = 31;
+pub(crate) const ZONE: u8 = 31;
 
 /// A satellite fix: metres on the plane of UTM zone 31 north.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -116,7 +116,7 @@ pub(super) fn read_fixes(path: &Path) -> Result<Vec<Fix>, DataError> {
 /// East and north in UTM zone 31 north of latitude and longitude, degrees on WGS84, or of northing
 /// and easting in either order: an easting has at most six digits before the point, and a northing
 /// of Europe has seven.
-pub(super) fn to_utm31(a: f64, b: f64) -> Option<(f64, f64)> {
+pub(crate) fn to_utm31(a: f64, b: f64) -> Option<(f64, f64)> {
     let easting = 100_000.0..1_000_000.0;
     let northing = 1_000_000.0..10_000_000.0;
     // Farther from the meridian at 3 degrees the series of the projection does not hold.
