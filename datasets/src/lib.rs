@@ -29,6 +29,7 @@ mod source;
 pub mod synth;
 mod text;
 mod write_folder;
+mod write_katwijk;
 
 pub use calibration::load_rig;
 pub use correction::{Corrected, Correction};
@@ -43,3 +44,4 @@ pub use source::{Plane, Rgb, StereoFrame, StereoSource, luma, planar};
 pub use synth::Synth;
 pub use text::read_planar;
 pub use write_folder::{write_folder, write_synth};
+pub use write_katwijk::write_katwijk;

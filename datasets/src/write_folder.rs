@@ -129,7 +129,7 @@ impl Written for Synth {
 }
 
 /// Runs `write` on a folder beside `dir` that takes its place when all went well.
-fn write_beside(
+pub(crate) fn write_beside(
     dir: &Path,
     write: impl FnOnce(&Path) -> Result<(), DataError>,
 ) -> Result<(), DataError> {
@@ -211,7 +211,7 @@ fn write_mask(path: &Path, mask: &Plane) -> Result<(), DataError> {
 }
 
 /// Writes an image as an 8-bit PNG.
-fn write_rgb(path: &Path, image: &Rgb) -> Result<(), DataError> {
+pub(crate) fn write_rgb(path: &Path, image: &Rgb) -> Result<(), DataError> {
     let bytes = image
         .as_raw()
         .iter()

@@ -3,6 +3,7 @@
 
 mod euroc;
 pub(crate) mod folder;
+pub(crate) mod katwijk;
 mod kitti_odometry;
 mod kitti_stereo;
 mod middlebury;
@@ -31,6 +32,8 @@ pub(crate) const ON_DISK: &[Format] = &[
     middlebury::FORMAT,
     sceneflow::FORMAT,
     euroc::FORMAT,
+    katwijk::FORMAT,
+    katwijk::PAN_CAM,
     folder::FORMAT,
 ];
 

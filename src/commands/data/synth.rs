@@ -1,9 +1,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use barchan_datasets::{StereoSource, Synth, open, synth, write_folder, write_synth};
+use barchan_datasets::{
+    StereoSource, Synth, open, synth, write_folder, write_katwijk, write_synth,
+};
 use barchan_terrain::{Grid, Raster};
-use clap::Parser;
+use clap::{Parser, ValueEnum};
 
 use super::written;
 use crate::output::Output;
@@ -14,7 +16,8 @@ use crate::output::Output;
     barchan data synth synth:seed=1,frames=40 --out data\n  \
     barchan data synth synth:route=survey,look=moon,frames=300 --out survey\n  \
     barchan data synth synth:dem=yard.tif,frames=100 --out yard\n  \
-    barchan data synth synth:frames=1000,width=256,height=192 --random-scenes --out shapes\n\n\
+    barchan data synth synth:frames=1000,width=256,height=192 --random-scenes --out shapes\n  \
+    barchan data synth synth:width=1024,height=768,rectified=false,bloom=1 --layout katwijk --out part1\n\n\
     Options after synth:, by commas\n{}", synth::OPTIONS))]
 pub struct Args {
     /// What to render: synth:seed=N,frames=N,... as below
@@ -22,15 +25,34 @@ pub struct Args {
     /// Random shapes for pretraining instead of a traverse, as synth:scenes,... gives any command
     #[arg(long)]
     random_scenes: bool,
+    /// Which files a traverse is written as
+    #[arg(long, value_enum, default_value = "folder")]
+    layout: Layout,
+    /// With --layout katwijk: seconds that images are ahead of the fixes
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 0.0,
+        allow_negative_numbers = true
+    )]
+    images_ahead: f64,
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Layout {
+    Folder,
+    Katwijk,
 }
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     let Args {
         data,
         random_scenes,
+        layout,
+        images_ahead,
         out,
     } = args;
     let options = match data.as_str() {
@@ -47,6 +69,9 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     };
     let traverse = options.filter(|_| !scenes && !random_scenes);
     let Some(options) = traverse else {
+        if layout != Layout::Folder {
+            bail!("{data}: --layout katwijk goes with synth:seed=N,frames=N,...");
+        }
         let source = open(&data)?;
         let bar = output.progress("render", source.len());
         write_folder(source.as_ref(), &out, |done| bar.set_position(done as u64))?;
@@ -55,7 +80,18 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     };
     let traverse = Synth::parse(options)?;
     let bar = output.progress("render", traverse.len());
-    write_synth(&traverse, &out, |done| bar.set_position(done as u64))?;
+    let tell = |done| bar.set_position(done as u64);
+    if layout == Layout::Katwijk {
+        write_katwijk(&traverse, &out, images_ahead, tell)?;
+        bar.finish_and_clear();
+        let frames = traverse.len();
+        let text = format!(
+            "{frames} pairs in {}: a part of the Katwijk archive",
+            out.display()
+        );
+        return output.result(&super::Written { frames, out }, &text);
+    }
+    write_synth(&traverse, &out, tell)?;
     bar.finish_and_clear();
     write_ground(&traverse, &out.join("dem.tif"))?;
     written(&traverse, out, ", the ground as dem.tif", output)
