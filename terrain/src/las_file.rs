@@ -2,7 +2,7 @@ use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-use laz::{LasZipCompressor, LasZipDecompressor, LazItemRecordBuilder, LazVlr};
+use laz::{LasZipCompressor, LasZipDecompressor, LazItem, LazItemRecordBuilder, LazVlr};
 use nalgebra::Point3;
 
 use crate::atomic::write_atomically;
@@ -190,8 +190,10 @@ impl Cloud {
             (true, None) => return Err(bad("it is compressed and does not say how")),
             (true, Some(content)) => {
                 let vlr = LazVlr::from_buffer(&content).map_err(|e| bad(&e.to_string()))?;
-                if vlr.items_size() != size as u64 {
-                    return Err(bad("its compressed points have another size than it says"));
+                if !items_are_those_of(&vlr, format, size) {
+                    return Err(bad(
+                        "its compressed points are not those of its point format",
+                    ));
                 }
                 Points::Packed(
                     LasZipDecompressor::new(source, vlr).map_err(|e| bad(&e.to_string()))?,
@@ -222,6 +224,19 @@ impl Cloud {
         }
         Ok(Self { points })
     }
+}
+
+/// Whether a file is compressed as its point format says: the decompressor believes every item its size.
+fn items_are_those_of(vlr: &LazVlr, format: u8, size: usize) -> bool {
+    let of = |extra| LazItemRecordBuilder::default_for_point_format_id(format, extra);
+    let sizes = |items: &[LazItem]| items.iter().map(|i| usize::from(i.size())).sum::<usize>();
+    let extra = of(0).map(|plain| size.checked_sub(sizes(&plain)));
+    let Ok(Some(Ok(expected))) = extra.map(|e| e.map(|e| of(e as u16))) else {
+        return false;
+    };
+    // Versions of an item differ between writers, its kind and size do not.
+    let kind = |i: &LazItem| (i.item_type(), i.size());
+    expected.iter().map(kind).eq(vlr.items().iter().map(kind))
 }
 
 /// Where points are read from.
