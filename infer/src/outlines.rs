@@ -234,19 +234,25 @@ fn propose(d: &[f32], slopes: &[Vec<f32>; 2], [width, height]: [usize; 2], y: us
         })
         .collect();
     around.sort_by_key(|[dx, dy]| dx * dx + dy * dy);
-    // Whether a surface around is another: for the whole row at once, since few are.
+    // What each offset proposes, and how far it is from what is there, for the whole row at once; NaN outside.
     let row = &d[y * width..][..width];
-    let mut other = vec![false; width];
-    for [dx, dy] in &around {
+    let mut proposals = vec![f32::NAN; around.len() * width];
+    let mut farthest = vec![0.0f32; width];
+    for ([dx, dy], proposals) in around.iter().zip(proposals.chunks_exact_mut(width)) {
         let line = y.saturating_add_signed(*dy) * width;
         let (from, to) = columns(width, *dx);
         let shifted = line + from.saturating_add_signed(*dx)..line + to.saturating_add_signed(*dx);
         let there = d[shifted.clone()].iter();
         let slopes = slopes[0][shifted.clone()].iter().zip(&slopes[1][shifted]);
-        let here = row[from..to].iter().zip(&mut other[from..to]);
-        for ((there, (gx, gy)), (here, other)) in there.zip(slopes).zip(here) {
-            let proposed = there - gx * *dx as f32 - gy * *dy as f32;
-            *other |= (proposed - here).abs() > SAME;
+        let here = row[from..to].iter().zip(&mut farthest[from..to]);
+        let (right, down) = (*dx as f32, *dy as f32);
+        for (((there, (gx, gy)), (here, farthest)), proposed) in
+            there.zip(slopes).zip(here).zip(&mut proposals[from..to])
+        {
+            *proposed = there - gx * right - gy * down;
+            let far = (*proposed - here).abs();
+            // Not `max`, which asks for NaN twice.
+            *farthest = if far > *farthest { far } else { *farthest };
         }
     }
     let mut choices = Choices {
@@ -254,20 +260,19 @@ fn propose(d: &[f32], slopes: &[Vec<f32>; 2], [width, height]: [usize; 2], y: us
         slot: vec![NONE; width],
         ..Choices::default()
     };
-    for x in (0..width).filter(|&x| other[x]) {
+    for x in (0..width).filter(|&x| farthest[x] > SAME) {
         let start = choices.disparity.len();
         choices.disparity.push(row[x]);
         choices.source.push((y * width + x) as u32);
-        for [dx, dy] in &around {
-            let Some(qx) = x.checked_add_signed(*dx).filter(|&qx| qx < width) else {
-                continue;
-            };
-            let q = y.saturating_add_signed(*dy) * width + qx;
-            let proposed = d[q] - slopes[0][q] * *dx as f32 - slopes[1][q] * *dy as f32;
+        for (n, [dx, dy]) in around.iter().enumerate() {
+            let proposed = proposals[n * width + x];
             let new = |there: &f32| (there - proposed).abs() > SAME;
             if proposed >= 0.0 && choices.disparity[start..].iter().all(new) {
                 choices.disparity.push(proposed);
-                choices.source.push(q as u32);
+                let line = y.saturating_add_signed(*dy) * width;
+                choices
+                    .source
+                    .push((line + x.saturating_add_signed(*dx)) as u32);
                 if choices.disparity.len() - start == MOST {
                     break;
                 }
