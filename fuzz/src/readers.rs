@@ -310,7 +310,10 @@ fn folder(name: &str, bytes: &[u8]) -> bool {
 fn sensor(name: &str) -> Vec<Vec<u8>> {
     let bytes = folder_path().and_then(|f| std::fs::read(f.join(name)).ok());
     let mut bytes = bytes.unwrap_or_default();
+    // Whole lines: the seed must be one that is read.
     bytes.truncate(2000);
+    let lines = bytes.iter().rposition(|b| *b == b'\n');
+    bytes.truncate(lines.map_or(0, |end| end + 1));
     vec![bytes]
 }
 

@@ -157,18 +157,11 @@ fn data() -> (tempfile::TempDir, PathBuf) {
 fn it_answers_as_infer_slam_and_map_do() {
     let (dir, data) = data();
     let [infer, slam, runs] = ["infer", "slam", "runs"].map(|n| dir.path().join(n));
-    for (command, out) in [("infer", &infer), ("slam", &slam)] {
-        let args = [
-            command,
-            "--model",
-            "sgm:64",
-            "--data",
-            text(&data),
-            "--no-check",
-            "--out",
-        ];
-        json(&[&args[..], &[text(out)]].concat());
-    }
+    let args = ["--model", "sgm:64", "--data", text(&data), "--no-check"];
+    json(&[&["infer"], &args[..], &["--out", text(&infer)]].concat());
+    // The service is sent images alone.
+    let blind = ["--no-fusion", "--out", text(&slam)];
+    json(&[&["slam"], &args[..], &blind].concat());
     let times = std::fs::read_to_string(data.join("times.txt")).unwrap();
     let times: Vec<&str> = times.lines().collect();
     let service = Service::start(&data, &["--runs", text(&runs)]);

@@ -45,7 +45,7 @@ fn part() -> tempfile::TempDir {
     );
     let (radius, speed, half) = (0.125, 0.5, 0.2 * 0.8 / 2.0);
     let wheels = |k: u32| {
-        let rate = |w: u32| (speed + if w % 2 == 0 { -half } else { half }) / radius;
+        let rate = |w: u32| (speed + if w.is_multiple_of(2) { -half } else { half }) / radius;
         let drive: String = (0..6)
             .map(|w| format!(" {} {} 1.5", rate(w) * f64::from(k) / 10.0, rate(w)))
             .collect();
