@@ -198,6 +198,7 @@ mod tests {
     #[test]
     fn damaged_files_are_refused_and_never_a_panic() {
         let dir = tempfile::tempdir().unwrap();
+        let mut wrong = vec![];
         for reader in READERS {
             let file = dir.path().join(reader.file);
             let read = |bytes: &[u8]| {
@@ -205,11 +206,10 @@ mod tests {
                 (reader.read)(&file, bytes)
             };
             let seeds = (reader.seeds)();
-            assert!(
-                seeds.iter().any(|s| read(s)),
-                "{}: no seed is read",
-                reader.name
-            );
+            if !seeds.iter().any(|s| read(s)) {
+                wrong.push(format!("{}: no seed is read", reader.name));
+                continue;
+            }
             let mut dice = ChaCha8Rng::seed_from_u64(5);
             let mut refused = 0;
             for k in 0..FILES {
@@ -220,7 +220,10 @@ mod tests {
                 let noise: Vec<u8> = (0..k).map(|_| dice.random()).collect();
                 read(&noise);
             }
-            assert!(refused > 0, "{}: it takes anything", reader.name);
+            if refused == 0 {
+                wrong.push(format!("{}: it takes anything", reader.name));
+            }
         }
+        assert!(wrong.is_empty(), "{wrong:?}");
     }
 }

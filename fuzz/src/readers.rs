@@ -253,7 +253,7 @@ fn onnx() -> Vec<Vec<u8>> {
 }
 
 fn vocabulary() -> Vec<Vec<u8>> {
-    let text = "3 2 0 0\n0 0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30 31 32 0.5\n0 1 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30 31 32 0.7\n";
+    let text = "3 2 0 0\n0 0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30 31 32 0.5\n1 1 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30 31 32 0.7\n";
     texts(&[text])
 }
 
@@ -303,8 +303,16 @@ fn folder(name: &str, bytes: &[u8]) -> bool {
     let Some(folder) = folder_path() else {
         return false;
     };
-    let written = std::fs::write(folder.join(name), bytes);
-    written.is_ok() && open(&format!("folder:{}", folder.display())).is_ok()
+    let file = folder.join(name);
+    let whole = std::fs::read(&file);
+    let read = std::fs::write(&file, bytes).is_ok()
+        && open(&format!("folder:{}", folder.display())).is_ok();
+    // The others of the folder are read with it: what is damaged must not stay.
+    let restored = match whole {
+        Ok(whole) => std::fs::write(&file, whole),
+        Err(_) => std::fs::remove_file(&file),
+    };
+    read && restored.is_ok()
 }
 
 fn sensor(name: &str) -> Vec<Vec<u8>> {
