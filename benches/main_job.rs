@@ -74,7 +74,7 @@ fn slam_track_8_frames(bencher: Bencher) {
         let mut slam = Slam::new(rig, SlamConfig::default(), None);
         frames
             .iter()
-            .filter(|f| slam.track(f).is_ok_and(|r| r.tracked))
+            .filter(|f| slam.track((*f).clone()).is_ok_and(|r| r.tracked))
             .count()
     });
 }

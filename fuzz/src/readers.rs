@@ -276,7 +276,7 @@ static TRACKED: LazyLock<(RectifiedRig, Vec<u8>)> = LazyLock::new(|| {
     for i in 0..2 {
         if let Ok(frame) = synth.frame(i) {
             // A lost frame leaves a smaller map.
-            let _ = slam.track(&frame);
+            let _ = slam.track(frame);
         }
     }
     (rig, slam.finish().map.to_bytes(&rig).unwrap_or_default())

@@ -64,6 +64,8 @@ pub struct SlamConfig {
     pub max_dissimilarity: f32,
     /// A key frame is made when matches fall under this share of the most since the last one.
     pub keyframe_ratio: f64,
+    /// Frames that may be tracked in the map as it was while a key frame comes into it; 0 waits for it.
+    pub map_lag: usize,
     /// Key frames that bundle adjustment moves.
     pub window: usize,
     /// Most iterations of a bundle adjustment.
@@ -103,6 +105,7 @@ impl Default for SlamConfig {
             gate_px: 3.0,
             max_dissimilarity: 0.4,
             keyframe_ratio: 0.9,
+            map_lag: 2,
             window: 8,
             ba_iterations: 8,
             min_inliers: 15,

@@ -97,6 +97,18 @@ pub struct LoopEvent {
     pub moved: f64,
 }
 
+/// How a camera that was lost came to the place that it was found at.
+#[derive(Clone, Copy, Debug)]
+#[allow(non_snake_case)]
+pub(crate) struct Way {
+    /// The key frame of the place.
+    pub place: usize,
+    /// The motion from the newest key frame, as the camera moved before it was lost or other sensors say.
+    pub T_keyframe_cam: Se3,
+    /// Its deviations, metres and radians.
+    pub sigma: (f64, f64),
+}
+
 /// Finds loops among the key frames of a map and closes them.
 pub(crate) struct LoopCloser {
     rig: RectifiedRig,
@@ -135,12 +147,18 @@ impl LoopCloser {
 
     /// Takes note of the newest key frame of the map, of which `dense` is the disparity. Looks for
     /// places that look like it, that its predecessors found too, and that it does not see the same
-    /// points as anyway. The first that geometry confirms is a loop: the pose graph is solved, key
-    /// frames and points move, and points that were mapped twice become one.
+    /// points as anyway; first of all the place where a lost camera was found, if it came some `way`. The
+    /// first that geometry confirms is a loop: the pose graph is solved, key frames and points move, and
+    /// points that were mapped twice become one.
     ///
     /// Gives each place that was tried.
     #[allow(non_snake_case)]
-    pub fn close(&mut self, map: &mut Map, dense: Option<&Plane>) -> Vec<LoopEvent> {
+    pub fn close(
+        &mut self,
+        map: &mut Map,
+        dense: Option<&Plane>,
+        way: Option<Way>,
+    ) -> Vec<LoopEvent> {
         let Some(newest) = map.keyframes.len().checked_sub(1) else {
             return Vec::new();
         };
@@ -149,10 +167,24 @@ impl LoopCloser {
         let loops = &self.config.loops;
         let skip = |k: usize| k + loops.min_gap > newest || connected.contains(&k);
         let descriptors = &map.keyframes[newest].features.descriptors;
-        let islands = self.places.add(descriptors, loops.min_score, skip);
+        let mut islands = self.places.add(descriptors, loops.min_score, skip);
+        islands.retain(|island| island.streak >= loops.min_streak);
+        if let Some(way) = way {
+            // Where nothing links both, the graph could not share out what lies between them.
+            self.edges.push(PoseEdge {
+                a: newest - 1,
+                b: newest,
+                T_a_b: way.T_keyframe_cam,
+                sigma_translation: way.sigma.0,
+                sigma_rotation: way.sigma.1,
+                robust: true,
+            });
+            islands.insert(0, self.places.island(way.place));
+        }
 
+        let loops = &self.config.loops;
         let mut events = Vec::new();
-        for island in islands.iter().filter(|i| i.streak >= loops.min_streak) {
+        for island in &islands {
             let (mut event, found) = self.verify(map, newest, island);
             event.proved = found.is_some();
             if let Some(found) = found.filter(|_| loops.correct) {
@@ -292,9 +324,9 @@ impl LoopCloser {
         let features = &map.keyframes[keyframe].features;
         let grid = Grid::new(&features.keypoints, self.rig.width, self.rig.height);
         let features = (features, &grid);
+        let known = points.iter().filter_map(|id| map.points.get_key_value(id));
         find_points(
-            map,
-            points,
+            known,
             T_cam_world,
             features,
             RADIUS,

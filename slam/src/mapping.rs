@@ -1,33 +1,200 @@
 //! What a key frame adds to the map, and how the map then settles (Pire 2017, mapping thread).
 
-use barchan_datasets::{Rgb, StereoFrame};
-use barchan_geometry::{RectifiedRig, StereoPoint};
-use nalgebra::{Point3, Vector2};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Instant;
 
-use crate::SlamConfig;
+use barchan_datasets::{Rgb, StereoFrame};
+use barchan_geometry::{RectifiedRig, Se3, StereoPoint};
+use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
+use nalgebra::{Point3, Vector2};
+use serde::Serialize;
+
 use crate::bundle_adjustment::BundleAdjustment;
 use crate::frame::Seen;
+use crate::loops::{LoopCloser, LoopEvent, Way};
 use crate::map::{Keyframe, Map, PointId};
+use crate::matching::{DisparityGate, MatchCounts};
 use crate::patch::Patch;
 use crate::pose::Observation;
 use crate::tracker::Placement;
+use crate::{SlamConfig, SlamError};
 
-/// Adds a key frame to a part of the map: sightings of known points, new points from the other stereo
-/// features, local bundle adjustment over the key frames around it, culling.
-pub(crate) fn insert_keyframe(
-    map: &mut Map,
-    frame: &StereoFrame,
-    seen: Seen,
-    placement: &Placement,
-    submap: usize,
-    rig: &RectifiedRig,
-    config: &SlamConfig,
-) {
-    let keyframe = add_keyframe(map, frame, &seen, placement, submap);
-    add_new_points(map, keyframe, &frame.left, &seen, rig, config);
-    let local = map.around(keyframe, config.window);
-    adjust_locally(map, &local, rig, config);
-    cull(map, keyframe);
+/// What a key frame came to, once it is in the map.
+#[derive(Clone, Debug, Serialize)]
+#[allow(non_snake_case)]
+pub struct Mapped {
+    /// Index of the frame in the sequence.
+    pub frame: usize,
+    /// Name of the frame.
+    pub name: String,
+    /// How its stereo matches were decided.
+    pub matches: MatchCounts,
+    /// Places that it looked like; a closed loop moved the map.
+    pub loops: Vec<LoopEvent>,
+    /// Milliseconds of dense disparity; 0 without an engine.
+    pub ms_disparity: f64,
+    /// Milliseconds of all that came after disparity.
+    pub ms_map: f64,
+    /// Its left image. Not serialised.
+    #[serde(skip)]
+    pub left: Rgb,
+    /// Dense disparity after rejection, when there is an engine. Not serialised.
+    #[serde(skip)]
+    pub dense: Option<DisparityMap>,
+    /// Where the world went under the key frame: see `Tracker::map_moved`.
+    #[serde(skip)]
+    pub(crate) T_old_new: Se3,
+}
+
+/// A frame that is to become a key frame.
+pub(crate) struct Candidate {
+    pub frame: StereoFrame,
+    pub seen: Seen,
+    pub placement: Placement,
+    /// The part of the map that it belongs to.
+    pub submap: usize,
+    /// How it came to a place that it was found at, after the camera was lost.
+    pub way: Option<Way>,
+}
+
+/// Makes the map: key frames in, one by one.
+pub(crate) struct Mapper {
+    rig: RectifiedRig,
+    config: SlamConfig,
+    engine: Option<Box<dyn DisparityEngine>>,
+    pub map: Map,
+    pub loops: Option<LoopCloser>,
+}
+
+impl Mapper {
+    pub fn new(
+        rig: RectifiedRig,
+        config: SlamConfig,
+        engine: Option<Box<dyn DisparityEngine>>,
+        loops: Option<LoopCloser>,
+    ) -> Self {
+        Self {
+            rig,
+            config,
+            engine,
+            map: Map::default(),
+            loops,
+        }
+    }
+
+    /// Adds a key frame to the map: dense disparity, stereo matches gated by it (Hong 2021, 3.2.3);
+    /// sightings of known points, new points from the other stereo features, local bundle adjustment
+    /// over the key frames around it, culling; loops.
+    #[allow(non_snake_case)]
+    fn add(&mut self, candidate: Candidate) -> Result<Mapped, SlamError> {
+        let Candidate {
+            frame,
+            mut seen,
+            placement,
+            submap,
+            way,
+        } = candidate;
+        let started = Instant::now();
+        let dense = self.dense_disparity(&frame)?;
+        let ms_disparity = dense.as_ref().map_or(0.0, |_| ms_since(started));
+
+        let started = Instant::now();
+        if let Some(dense) = dense.as_ref().filter(|_| self.config.gate) {
+            let gate = DisparityGate {
+                disparity: &dense.disparity,
+                threshold: self.config.gate_px,
+            };
+            seen.match_stereo(&self.rig, Some(&gate), &self.config);
+        }
+        let (map, rig, config) = (&mut self.map, &self.rig, &self.config);
+        let keyframe = add_keyframe(map, &frame, &seen, &placement, submap);
+        add_new_points(map, keyframe, &frame.left, &seen, rig, config);
+        let local = map.around(keyframe, config.window);
+        adjust_locally(map, &local, rig, config);
+        cull(map, keyframe);
+        let dense_disparity = dense.as_ref().map(|d| &d.disparity);
+        let loops = (self.loops.as_mut()).map(|closer| closer.close(map, dense_disparity, way));
+        let mut T_old_new = placement
+            .T_cam_world
+            .inv_mul(&map.keyframes[keyframe].T_cam_world);
+        T_old_new.rotation.renormalize();
+        Ok(Mapped {
+            frame: frame.index,
+            name: frame.name,
+            matches: seen.matches,
+            loops: loops.unwrap_or_default(),
+            ms_disparity,
+            ms_map: ms_since(started),
+            left: frame.left,
+            dense,
+            T_old_new,
+        })
+    }
+
+    /// Dense disparity less what the pair itself contradicts; `None` without an engine.
+    fn dense_disparity(&mut self, frame: &StereoFrame) -> Result<Option<DisparityMap>, SlamError> {
+        let Some(engine) = &mut self.engine else {
+            return Ok(None);
+        };
+        let dense = engine.disparity(&frame.left, &frame.right);
+        let mut dense = dense.map_err(|source| SlamError::Disparity {
+            frame: frame.name.clone(),
+            source,
+        })?;
+        let rejection = Rejection {
+            max_dissimilarity: self.config.max_dissimilarity,
+        };
+        rejection.apply(&frame.left, &frame.right, &mut dense);
+        Ok(Some(dense))
+    }
+}
+
+fn ms_since(started: Instant) -> f64 {
+    started.elapsed().as_secs_f64() * 1e3
+}
+
+/// The map, and the thread that at times works on it while frames are tracked (Pire 2017).
+pub(crate) struct Mapping {
+    mapper: Arc<Mutex<Mapper>>,
+    work: Option<JoinHandle<Result<Mapped, SlamError>>>,
+}
+
+impl Mapping {
+    pub fn new(mapper: Mapper) -> Self {
+        Self {
+            mapper: Arc::new(Mutex::new(mapper)),
+            work: None,
+        }
+    }
+
+    /// Whether a key frame is being added.
+    pub fn is_busy(&self) -> bool {
+        self.work.is_some()
+    }
+
+    /// The map, when the key frame in hand is in it.
+    pub fn mapper(&self) -> MutexGuard<'_, Mapper> {
+        self.mapper.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Begins to add a key frame. [`Mapping::settle`] gives what became of it, and is to be called before
+    /// the next.
+    pub fn begin(&mut self, candidate: Candidate) {
+        let mapper = Arc::clone(&self.mapper);
+        self.work = Some(std::thread::spawn(move || {
+            let mut mapper = mapper.lock().unwrap_or_else(PoisonError::into_inner);
+            mapper.add(candidate)
+        }));
+    }
+
+    /// Waits until the key frame in hand, if there is one, is in the map.
+    pub fn settle(&mut self) -> Result<Option<Mapped>, SlamError> {
+        let joined = self.work.take().map(JoinHandle::join);
+        // What panics there has to be heard of here.
+        let result = joined.map(|r| r.unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        result.transpose()
+    }
 }
 
 fn add_keyframe(

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Descriptor, Features};
-use crate::map::{Map, PointId};
+use crate::map::{MapPoint, PointId};
 use crate::{Keypoint, SlamConfig};
 
 /// Differing bits of two descriptors.
@@ -247,9 +247,8 @@ pub(crate) struct ProjectedMatches {
 
 /// Features of an image, `radius` around where a pose puts map points, that look like them.
 #[allow(non_snake_case)]
-pub(crate) fn find_points(
-    map: &Map,
-    points: &[PointId],
+pub(crate) fn find_points<'a>(
+    points: impl Iterator<Item = (&'a PointId, &'a MapPoint)>,
     T_cam_world: &Se3,
     (features, grid): (&Features, &Grid),
     radius: f64,
@@ -258,8 +257,7 @@ pub(crate) fn find_points(
 ) -> ProjectedMatches {
     let (width, height) = (rig.width as f64, rig.height as f64);
     let (mut ids, mut expected) = (Vec::new(), Vec::new());
-    for id in points {
-        let point = &map.points[id];
+    for (id, point) in points {
         let Some(at) = rig.project(&(T_cam_world * point.position)) else {
             continue;
         };

@@ -87,6 +87,22 @@ impl Places {
         islands_of(&scores).iter().map(|i| i.keyframe).collect()
     }
 
+    /// A key frame as a place that the newest one may look like.
+    pub fn island(&self, keyframe: usize) -> Island {
+        let score = match self.bags.as_slice() {
+            [.., before, newest] => {
+                let reference = newest.score(before).max(LEAST_REFERENCE);
+                newest.score(&self.bags[keyframe]) / reference
+            }
+            _ => 0.0,
+        };
+        Island {
+            keyframe,
+            score,
+            streak: 1,
+        }
+    }
+
     /// The score of each key frame with a bag: see [`BagOfWords::score`].
     fn scores(&self, bag: &BagOfWords) -> Vec<f64> {
         let mut scores = vec![0.0; self.bags.len()];

@@ -4,18 +4,18 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use barchan_datasets::{Sensors, StereoFrame};
-use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory};
-use barchan_infer::{DisparityEngine, DisparityMap, Rejection};
+use barchan_geometry::{RectifiedRig, Se3, StampedPose, Trajectory, se3};
+use barchan_infer::DisparityEngine;
 use nalgebra::Matrix6;
 use serde::Serialize;
 
 use crate::features::FeatureDetector;
 use crate::frame::Seen;
 use crate::fusion::{Fusion, FusionCounts, MotionPrior};
-use crate::loops::{LoopCloser, LoopEvent};
+use crate::local_map::LocalMap;
+use crate::loops::{LoopCloser, Way};
 use crate::map::{Keyframe, Map};
-use crate::mapping::insert_keyframe;
-use crate::matching::{DisparityGate, MatchCounts};
+use crate::mapping::{Candidate, Mapped, Mapper, Mapping};
 use crate::tracker::{Placement, Tracker};
 use crate::uncertainty::pose_covariances;
 use crate::vocabulary::Vocabulary;
@@ -42,17 +42,11 @@ pub struct FrameReport {
     pub carried: bool,
     /// Whether it became a key frame.
     pub keyframe: bool,
-    /// How stereo matches were decided, at key frames.
-    pub matches: MatchCounts,
-    /// Milliseconds from images to pose and map, without dense disparity.
+    /// Milliseconds from images to pose, with what it waited for the map.
     pub ms_track: f64,
-    /// Milliseconds of dense disparity; 0 where none was asked for.
-    pub ms_disparity: f64,
-    /// Places that the key frame looked like; a closed loop moved the map.
-    pub loops: Vec<LoopEvent>,
-    /// Dense disparity after rejection, at key frames when there is an engine. Not serialised.
+    /// The key frame that came into the map meanwhile: this one, or one before. Not serialised.
     #[serde(skip)]
-    pub dense: Option<DisparityMap>,
+    pub mapped: Option<Mapped>,
 }
 
 /// What is left when all frames are through.
@@ -86,22 +80,38 @@ struct Placed {
     T_cam_keyframe: Se3,
 }
 
+/// Where a frame should be, before its images were looked at.
+#[allow(non_snake_case)]
+struct Prediction {
+    T_cam_world: Se3,
+    /// Whether sensors other than the cameras say so.
+    by_sensors: bool,
+}
+
 /// Tracks a sequence and builds its map.
+///
+/// A key frame comes into the map in a thread of its own, while the next
+/// [`SlamConfig::map_lag`] frames are tracked in the map as it was; then, or when that does not do, it is
+/// waited for. So what a frame is tracked against depends on the images and not on the clock.
 pub struct Slam {
     rig: RectifiedRig,
     config: SlamConfig,
     detector: Box<dyn FeatureDetector>,
-    engine: Option<Box<dyn DisparityEngine>>,
     tracker: Tracker,
-    map: Map,
+    mapping: Mapping,
+    /// What frames are tracked against; `None` before the first key frame.
+    local: Option<LocalMap>,
     placed: Vec<Placed>,
+    /// Time and pose of the newest frame.
+    latest: Option<StampedPose>,
     /// Key frames of the map that were there before the first frame.
     known: usize,
     /// Most inliers of a frame since the last key frame, that one included.
     most_inliers: usize,
+    /// Frames since the last key frame.
+    since_keyframe: usize,
     /// Frames lost in a row.
     lost: usize,
-    loops: Option<LoopCloser>,
     /// What other sensors say of the motion.
     prior: Option<MotionPrior>,
 }
@@ -113,19 +123,20 @@ impl Slam {
         config: SlamConfig,
         engine: Option<Box<dyn DisparityEngine>>,
     ) -> Self {
+        let words = Vocabulary::shipped(config.detector);
+        let loops = (config.loops.enabled).then(|| LoopCloser::new(rig, config.clone(), words));
         Self {
             detector: config.feature_detector(),
-            loops: config.loops.enabled.then(|| {
-                LoopCloser::new(rig, config.clone(), Vocabulary::shipped(config.detector))
-            }),
             tracker: Tracker::new(rig, config.clone()),
+            mapping: Mapping::new(Mapper::new(rig, config.clone(), engine, loops)),
             rig,
             config,
-            engine,
-            map: Map::default(),
+            local: None,
             placed: Vec::new(),
+            latest: None,
             known: 0,
             most_inliers: 0,
+            since_keyframe: 0,
             lost: 0,
             prior: None,
         }
@@ -146,20 +157,23 @@ impl Slam {
     }
 
     /// Recognises places by these words instead of the shipped ones.
-    pub fn with_vocabulary(mut self, words: Vocabulary) -> Self {
-        self.loops = (self.config.loops.enabled)
-            .then(|| LoopCloser::new(self.rig, self.config.clone(), Arc::new(words)));
+    pub fn with_vocabulary(self, words: Vocabulary) -> Self {
+        let closer = LoopCloser::new(self.rig, self.config.clone(), Arc::new(words));
+        self.mapping.mapper().loops = self.config.loops.enabled.then_some(closer);
         self
     }
 
     /// Goes on in a map made before, by the same rig and detector: the first frames are looked for in
     /// it. To be called before the first frame; then `with_vocabulary` comes before.
     pub fn with_map(mut self, map: Map) -> Self {
-        if let Some(closer) = &mut self.loops {
+        let mut mapper = self.mapping.mapper();
+        if let Some(closer) = &mut mapper.loops {
             closer.learn(&map);
         }
-        self.known = map.keyframes.len();
-        self.map = map;
+        mapper.map = map;
+        self.known = mapper.map.keyframes.len();
+        drop(mapper);
+        self.local = self.newest_local_map();
         self
     }
 
@@ -172,9 +186,9 @@ impl Slam {
     /// When the frame has not the size of the rig, or a detector or the engine fails. A frame that
     /// cannot be placed is no error but a report with a reason.
     #[allow(non_snake_case)]
-    pub fn track(&mut self, frame: &StereoFrame) -> Result<FrameReport, SlamError> {
+    pub fn track(&mut self, frame: StereoFrame) -> Result<FrameReport, SlamError> {
         let started = Instant::now();
-        let seen = Seen::new(frame, &self.rig, self.detector.as_ref(), &self.config)?;
+        let seen = Seen::new(&frame, &self.rig, self.detector.as_ref(), &self.config)?;
         let mut report = FrameReport {
             frame: frame.index,
             name: frame.name.clone(),
@@ -185,102 +199,122 @@ impl Slam {
             reason: String::new(),
             carried: false,
             keyframe: false,
-            matches: seen.matches,
             ms_track: 0.0,
-            ms_disparity: 0.0,
-            loops: Vec::new(),
-            dense: None,
+            mapped: None,
         };
         let enough_stereo = report.stereo >= self.config.min_inliers;
-        let fused = (self.prior.as_mut()).and_then(|prior| prior.predict(frame.time));
-        let T_predicted = fused.unwrap_or_else(|| self.tracker.predict(frame.time));
+        if self.since_keyframe >= self.config.map_lag {
+            report.mapped = self.settle()?;
+        }
+        let mut prediction = self.predict(frame.time);
+        let mut placement = self.place_near(&seen, &prediction);
+        let does = |p: &Placement| !self.runs_low(p.sightings.len());
+        if self.mapping.is_busy() && !placement.as_ref().is_some_and(does) {
+            report.mapped = self.settle()?;
+            prediction = self.predict(frame.time);
+            placement = self.place_near(&seen, &prediction);
+        }
+        let time = frame.time;
+        let T_predicted = prediction.T_cam_world;
         let guess = Placement {
             T_cam_world: T_predicted,
             sightings: Vec::new(),
             carried: self.prior.as_ref().and_then(MotionPrior::sigma),
         };
 
-        let newest = self.map.keyframes.len().checked_sub(1);
-        let local = newest.map_or(vec![], |k| self.map.around(k, self.config.window));
-        let placement = (self.tracker).track(&seen, &T_predicted, &self.map, &local);
         let contradicts = (placement.as_ref()).is_some_and(|p| !self.agrees(&seen, p));
+        let here = self.local.as_ref().map(|local| local.submap);
+        self.since_keyframe += 1;
         if let Some(placement) = placement.filter(|_| !contradicts) {
             report.inliers = placement.sightings.len();
             self.lost = 0;
             self.most_inliers = self.most_inliers.max(report.inliers);
-            self.tracker.moved_to(placement.T_cam_world, frame.time);
-            let few = self.config.keyframe_ratio * self.most_inliers as f64;
-            if (report.inliers as f64) < few {
-                let submap = newest.map_or(0, |k| self.map.keyframes[k].submap);
-                self.make_keyframe(frame, seen, &placement, submap, &mut report)?;
+            self.tracker.moved_to(placement.T_cam_world, time);
+            if self.runs_low(report.inliers) {
+                let submap = here.unwrap_or(0);
+                self.make_keyframe(frame, seen, placement, submap, None, &mut report)?;
             } else {
-                self.place(frame.time, placement.T_cam_world);
+                self.place(time, placement.T_cam_world);
             }
-        } else if newest.is_none() && enough_stereo {
+        } else if here.is_none() && enough_stereo {
             report.inliers = report.stereo;
-            self.tracker.moved_to(T_predicted, frame.time);
+            self.tracker.moved_to(T_predicted, time);
             self.count_from(&seen, &guess);
-            self.make_keyframe(frame, seen, &guess, 0, &mut report)?;
-        } else if let Some((place, placement)) =
-            (!contradicts).then(|| self.find_again(&seen)).flatten()
-        {
-            // What follows is tracked against this place: it is the newest key frame at once.
-            let submap = self.map.keyframes[place].submap;
-            report.found_again_at = Some(self.map.keyframes[place].frame);
+            self.make_keyframe(frame, seen, guess, 0, None, &mut report)?;
+        } else if let Some(found) = (!contradicts).then(|| self.find_again(&seen)).flatten() {
+            let (local, placement) = found;
+            report.found_again_at = Some(self.mapping.mapper().map.keyframes[local.keyframe].frame);
             report.inliers = placement.sightings.len();
+            let way = self.way_to(&local, &prediction);
+            let submap = local.submap;
+            // What follows is tracked against this place.
+            self.local = Some(local);
             self.lost = 0;
-            self.tracker.lost_at(placement.T_cam_world, frame.time);
+            self.tracker.set_down_at(placement.T_cam_world, time);
             self.count_from(&seen, &placement);
-            self.make_keyframe(frame, seen, &placement, submap, &mut report)?;
+            self.make_keyframe(frame, seen, placement, submap, way, &mut report)?;
         } else {
             report.tracked = false;
-            report.carried = fused.is_some();
+            report.carried = prediction.by_sensors;
             report.reason = seen.describe();
             if contradicts {
                 report.reason += "; the motion that they show contradicts the other sensors";
             }
             self.lost += 1;
-            self.tracker.lost_at(T_predicted, frame.time);
+            self.tracker.moved_to(T_predicted, time);
             if self.lost > self.config.restart_after && enough_stereo {
                 self.lost = 0;
                 let joined = self.prior.as_ref().is_some_and(MotionPrior::is_sure);
-                let parts = self.map.keyframes.iter().map(|k| k.submap + 1);
-                let new = parts.max().unwrap_or(0);
-                let last = newest.filter(|_| joined);
-                let submap = last.map_or(new, |k| self.map.keyframes[k].submap);
+                let submap = here.filter(|_| joined).unwrap_or_else(|| self.new_submap());
                 report.reason += match joined {
                     true => "; the map goes on here, where other sensors say",
                     false => "; the map begins anew here, at a pose that is a guess",
                 };
                 self.count_from(&seen, &guess);
-                self.make_keyframe(frame, seen, &guess, submap, &mut report)?;
+                self.make_keyframe(frame, seen, guess, submap, None, &mut report)?;
             } else {
-                self.place(frame.time, T_predicted);
+                self.place(time, T_predicted);
             }
         }
-        report.ms_track = started.elapsed().as_secs_f64() * 1e3 - report.ms_disparity;
+        report.ms_track = started.elapsed().as_secs_f64() * 1e3;
         Ok(report)
+    }
+
+    /// Waits until the key frame in hand, if there is one, is in the map; tracking goes on in what is
+    /// around it. To be called after the last frame.
+    ///
+    /// # Errors
+    /// When the engine fails.
+    #[allow(non_snake_case)]
+    pub fn settle(&mut self) -> Result<Option<Mapped>, SlamError> {
+        let mapped = self.mapping.settle()?;
+        if let Some(mapped) = &mapped {
+            self.local = self.newest_local_map();
+            self.tracker.map_moved(&mapped.T_old_new);
+            if let Some(prior) = &mut self.prior {
+                prior.map_moved(&mapped.T_old_new);
+            }
+            if let Some(latest) = &mut self.latest {
+                latest.T_world_cam = mapped.T_old_new.inverse() * latest.T_world_cam;
+            }
+        }
+        Ok(mapped)
     }
 
     /// Time and pose of the newest frame as they are known now; of a lost one, as predicted. `None` before
     /// the first.
     pub fn pose(&self) -> Option<StampedPose> {
-        self.placed.last().map(|p| self.stamped(p))
+        self.latest
     }
 
-    /// The pose of a frame, following its key frame as that is now.
+    /// Every frame through: poses of all frames, following their corrected key frames. What
+    /// [`Slam::settle`] would say of a last key frame is not heard.
     #[allow(non_snake_case)]
-    fn stamped(&self, placed: &Placed) -> StampedPose {
-        let keyframe = self.map.keyframes.get(placed.keyframe);
-        let T_keyframe_world = keyframe.map(|k| k.T_cam_world).unwrap_or_default();
-        StampedPose {
-            time: placed.time,
-            T_world_cam: (placed.T_cam_keyframe * T_keyframe_world).inverse(),
-        }
-    }
-
-    /// Every frame through: poses of all frames, following their corrected key frames.
-    pub fn finish(self) -> SlamResult {
+    pub fn finish(mut self) -> SlamResult {
+        // A key frame that failed is not in the map.
+        let _ = self.mapping.settle();
+        let mut mapper = self.mapping.mapper();
+        let map = std::mem::take(&mut mapper.map);
         let keyframe = |k: &Keyframe| {
             let pose = StampedPose {
                 time: k.time,
@@ -288,44 +322,114 @@ impl Slam {
             };
             (k.frame, k.name.clone(), pose)
         };
-        let new = &self.map.keyframes[self.known..];
-        let loops = self.loops.as_ref().map_or(&[][..], LoopCloser::edges);
+        let stamped = |placed: &Placed| {
+            let keyframe = map.keyframes.get(placed.keyframe);
+            let T_keyframe_world = keyframe.map(|k| k.T_cam_world).unwrap_or_default();
+            StampedPose {
+                time: placed.time,
+                T_world_cam: (placed.T_cam_keyframe * T_keyframe_world).inverse(),
+            }
+        };
+        let new = &map.keyframes[self.known..];
+        let loops = mapper.loops.as_ref().map_or(&[][..], LoopCloser::edges);
         SlamResult {
-            covariances: pose_covariances(&self.map, loops, &self.rig, &self.config)
+            covariances: pose_covariances(&map, loops, &self.rig, &self.config)
                 .map(|all| all[self.known..].to_vec()),
             trajectory: Trajectory {
-                poses: self.placed.iter().map(|p| self.stamped(p)).collect(),
+                poses: self.placed.iter().map(stamped).collect(),
             },
             keyframes: new.iter().map(keyframe).collect(),
             submaps: new.iter().map(|k| k.submap).collect(),
             joined: (new.windows(2))
                 .filter(|pair| pair[1].carried.is_some() && pair[0].submap == pair[1].submap)
                 .count(),
-            map: self.map,
+            map,
         }
     }
 
-    /// Where a lost camera is, if it sees a place that the map has: the key frame of that place, and
-    /// the pose.
-    fn find_again(&self, seen: &Seen) -> Option<(usize, Placement)> {
-        let places = self
-            .loops
-            .as_ref()?
-            .likeliest(&seen.features[0].descriptors);
+    /// Where the next frame should be: as other sensors say, or as the camera moved till now.
+    #[allow(non_snake_case)]
+    fn predict(&mut self, time: f64) -> Prediction {
+        let fused = (self.prior.as_mut()).and_then(|prior| prior.predict(time));
+        let mut T_cam_world = fused.unwrap_or_else(|| self.tracker.predict(time));
+        // Poses that start from each other let an error of the norm grow without bound.
+        T_cam_world.rotation.renormalize();
+        Prediction {
+            T_cam_world,
+            by_sensors: fused.is_some(),
+        }
+    }
+
+    /// Where a frame is in the local map.
+    fn place_near(&self, seen: &Seen, prediction: &Prediction) -> Option<Placement> {
+        let local = self.local.as_ref()?;
+        self.tracker.track(seen, &prediction.T_cam_world, local)
+    }
+
+    /// Whether so few inliers want a key frame.
+    fn runs_low(&self, inliers: usize) -> bool {
+        let most = self.most_inliers.max(inliers);
+        (inliers as f64) < self.config.keyframe_ratio * most as f64
+    }
+
+    /// The surroundings of the newest key frame.
+    fn newest_local_map(&self) -> Option<LocalMap> {
+        let map = &self.mapping.mapper().map;
+        let newest = map.keyframes.len().checked_sub(1)?;
+        Some(LocalMap::around(map, newest, self.config.window))
+    }
+
+    /// The number of a new part of the map.
+    fn new_submap(&self) -> usize {
+        let mapper = self.mapping.mapper();
+        let parts = mapper.map.keyframes.iter().map(|k| k.submap + 1);
+        parts.max().unwrap_or(0)
+    }
+
+    /// Where a lost camera is, if it sees a place that the map has.
+    fn find_again(&self, seen: &Seen) -> Option<(LocalMap, Placement)> {
+        let mapper = self.mapping.mapper();
+        let closer = mapper.loops.as_ref()?;
+        let places = closer.likeliest(&seen.features[0].descriptors);
         places.into_iter().find_map(|place| {
-            let local = self.map.around(place, self.config.window);
-            let placement = self.tracker.track_by_looks(seen, &self.map, &local)?;
-            Some((place, placement))
+            let local = LocalMap::around(&mapper.map, place, self.config.window);
+            let placement = self.tracker.track_by_looks(seen, &local)?;
+            Some((local, placement))
+        })
+    }
+
+    /// The way to a place where the lost camera is found again: as other sensors say, or as it moved
+    /// before, were the place in the same part of the map.
+    #[allow(non_snake_case)]
+    fn way_to(&self, place: &LocalMap, prediction: &Prediction) -> Option<Way> {
+        /// What is not known of a motion that nobody saw, as a share of it, and at least.
+        const SHARE: f64 = 0.3;
+        const LEAST: (f64, f64) = (0.02, 0.01);
+        let before = self.local.as_ref()?;
+        let T_keyframe_cam = before.T_keyframe_world * prediction.T_cam_world.inverse();
+        let sensed = self.prior.as_ref().and_then(MotionPrior::sigma);
+        let sigma = sensed.or_else(|| {
+            let twist = se3::log(&T_keyframe_cam);
+            let (way, turn) = (
+                twist.fixed_rows::<3>(0).norm(),
+                twist.fixed_rows::<3>(3).norm(),
+            );
+            (before.submap == place.submap).then(|| (LEAST.0 + SHARE * way, LEAST.1 + SHARE * turn))
+        });
+        sigma.map(|sigma| Way {
+            place: place.keyframe,
+            T_keyframe_cam,
+            sigma,
         })
     }
 
     /// Whether the pose of a placement is one that other sensors can believe. If so, motions are
     /// counted from it on.
     fn agrees(&mut self, seen: &Seen, placement: &Placement) -> bool {
-        let Some(prior) = &mut self.prior else {
+        let (Some(prior), Some(local)) = (&mut self.prior, &self.local) else {
             return true;
         };
-        let covariance = self.tracker.covariance(seen, &self.map, placement);
+        let covariance = self.tracker.covariance(seen, local, placement);
         let agrees = prior.agrees(&placement.T_cam_world, &covariance);
         if agrees {
             prior.placed(placement.T_cam_world, covariance);
@@ -336,87 +440,66 @@ impl Slam {
     /// Other sensors count motions from this placement on, whatever they think of it.
     fn count_from(&mut self, seen: &Seen, placement: &Placement) {
         if let Some(prior) = &mut self.prior {
-            let covariance = self.tracker.covariance(seen, &self.map, placement);
+            // Without a map there are no sightings, and the pose is what it is by definition.
+            let covariance = (self.local.as_ref()).map_or_else(Matrix6::zeros, |local| {
+                self.tracker.covariance(seen, local, placement)
+            });
             prior.placed(placement.T_cam_world, covariance);
         }
     }
 
-    /// Dense disparity of the frame, stereo matches gated by it (Hong 2021, 3.2.3), and the frame
-    /// into the map.
+    /// Has the frame put into the map, and waits for it when no frame may be tracked meanwhile.
     fn make_keyframe(
         &mut self,
-        frame: &StereoFrame,
-        mut seen: Seen,
-        placement: &Placement,
+        frame: StereoFrame,
+        seen: Seen,
+        placement: Placement,
         submap: usize,
+        way: Option<Way>,
         report: &mut FrameReport,
     ) -> Result<(), SlamError> {
-        report.keyframe = true;
-        report.dense = self.dense_disparity(frame, report)?;
-        if let Some(dense) = report.dense.as_ref().filter(|_| self.config.gate) {
-            let gate = DisparityGate {
-                disparity: &dense.disparity,
-                threshold: self.config.gate_px,
-            };
-            seen.match_stereo(&self.rig, Some(&gate), &self.config);
-            report.matches = seen.matches;
+        if self.mapping.is_busy() {
+            // The pose is a guess: it was placed, but other sensors contradict.
+            report.mapped = self.settle()?;
         }
-        let keyframe = self.map.keyframes.len();
-        insert_keyframe(
-            &mut self.map,
+        report.keyframe = true;
+        self.most_inliers = report.inliers;
+        self.since_keyframe = 0;
+        self.placed.push(Placed {
+            time: frame.time,
+            keyframe: self.mapping.mapper().map.keyframes.len(),
+            T_cam_keyframe: Se3::identity(),
+        });
+        self.latest = Some(StampedPose {
+            time: frame.time,
+            T_world_cam: placement.T_cam_world.inverse(),
+        });
+        self.mapping.begin(Candidate {
             frame,
             seen,
             placement,
             submap,
-            &self.rig,
-            &self.config,
-        );
-        if let Some(closer) = &mut self.loops {
-            let dense = report.dense.as_ref().map(|d| &d.disparity);
-            report.loops = closer.close(&mut self.map, dense);
+            way,
+        });
+        if self.config.map_lag == 0 {
+            report.mapped = self.settle()?;
         }
-        self.most_inliers = report.inliers;
-        let settled = self.map.keyframes[keyframe].T_cam_world;
-        self.tracker.corrected_to(settled);
-        if let Some(prior) = &mut self.prior {
-            prior.corrected_to(settled);
-        }
-        self.place(frame.time, settled);
         Ok(())
     }
 
-    /// Dense disparity less what the pair itself contradicts; `None` without an engine.
-    fn dense_disparity(
-        &mut self,
-        frame: &StereoFrame,
-        report: &mut FrameReport,
-    ) -> Result<Option<DisparityMap>, SlamError> {
-        let Some(engine) = &mut self.engine else {
-            return Ok(None);
-        };
-        let started = Instant::now();
-        let mut dense = engine
-            .disparity(&frame.left, &frame.right)
-            .map_err(|source| SlamError::Disparity {
-                frame: frame.name.clone(),
-                source,
-            })?;
-        let rejection = Rejection {
-            max_dissimilarity: self.config.max_dissimilarity,
-        };
-        rejection.apply(&frame.left, &frame.right, &mut dense);
-        report.ms_disparity = started.elapsed().as_secs_f64() * 1e3;
-        Ok(Some(dense))
-    }
-
-    /// Notes the pose of a frame relative to the newest key frame.
+    /// Notes the pose of a frame relative to the key frame that it is tracked against.
     #[allow(non_snake_case)]
     fn place(&mut self, time: f64, T_cam_world: Se3) {
-        let T_keyframe_world = self.map.keyframes.last().map(|k| k.T_cam_world);
+        let local = self.local.as_ref();
+        let T_keyframe_world = local.map(|l| l.T_keyframe_world).unwrap_or_default();
         self.placed.push(Placed {
             time,
-            keyframe: self.map.keyframes.len().saturating_sub(1),
-            T_cam_keyframe: T_cam_world * T_keyframe_world.unwrap_or_default().inverse(),
+            keyframe: local.map_or(0, |l| l.keyframe),
+            T_cam_keyframe: T_cam_world * T_keyframe_world.inverse(),
+        });
+        self.latest = Some(StampedPose {
+            time,
+            T_world_cam: T_cam_world.inverse(),
         });
     }
 }

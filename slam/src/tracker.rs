@@ -7,7 +7,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::features::Descriptor;
 use crate::frame::Seen;
-use crate::map::{Map, PointId};
+use crate::local_map::LocalMap;
+use crate::map::PointId;
 use crate::matching::{ProjectedMatches, find_points, match_all};
 use crate::pose::{Observation, optimise_pose, reprojection_jacobian, sample_pose};
 use crate::{Keypoint, SlamConfig};
@@ -56,19 +57,10 @@ impl Tracker {
 
     /// Places a frame: match the local map where the predicted pose puts it, optimise the pose; where that fails, match the newest key frames by looks alone, sample
     /// a pose and optimise that. `None` when neither finds a pose that enough points agree with.
-    ///
-    /// `local` are the key frames of the local map, the nearest first.
     #[allow(non_snake_case)]
-    pub fn track(
-        &self,
-        seen: &Seen,
-        T_predicted: &Se3,
-        map: &Map,
-        local: &[usize],
-    ) -> Option<Placement> {
-        let points = map.points_of(local);
-        self.track_by_projection(seen, map, &points, T_predicted)
-            .or_else(|| self.track_by_looks(seen, map, local))
+    pub fn track(&self, seen: &Seen, T_predicted: &Se3, local: &LocalMap) -> Option<Placement> {
+        self.track_by_projection(seen, local, T_predicted)
+            .or_else(|| self.track_by_looks(seen, local))
     }
 
     /// The last pose moved on by the last velocity, scaled to the time that passed.
@@ -86,7 +78,7 @@ impl Tracker {
         }
     }
 
-    /// Takes note of the pose of a frame that was tracked.
+    /// Takes note of the pose of a frame that came on from the last one.
     #[allow(non_snake_case)]
     pub fn moved_to(&mut self, T_cam_world: Se3, time: f64) {
         self.velocity = self
@@ -95,18 +87,19 @@ impl Tracker {
         self.last = Some((T_cam_world, time));
     }
 
-    /// Takes note that the pose of a frame is a guess: the next one is looked for around it.
+    /// Takes note of the pose of a frame that did not: the next one is looked for around it.
     #[allow(non_snake_case)]
-    pub fn lost_at(&mut self, T_cam_world: Se3, time: f64) {
+    pub fn set_down_at(&mut self, T_cam_world: Se3, time: f64) {
         self.velocity = None;
         self.last = Some((T_cam_world, time));
     }
 
-    /// The map moved under the last frame.
+    /// The map moved under the last frame: what was at a place of the new world was at
+    /// `T_old_new` times it.
     #[allow(non_snake_case)]
-    pub fn corrected_to(&mut self, T_cam_world: Se3) {
+    pub fn map_moved(&mut self, T_old_new: &Se3) {
         if let Some((last, _)) = &mut self.last {
-            *last = T_cam_world;
+            *last *= T_old_new;
         }
     }
 
@@ -116,35 +109,34 @@ impl Tracker {
     fn track_by_projection(
         &self,
         seen: &Seen,
-        map: &Map,
-        points: &[PointId],
+        local: &LocalMap,
         T_predicted: &Se3,
     ) -> Option<Placement> {
         [12.0, 24.0, 48.0].into_iter().find_map(|radius| {
-            let matches = self.project_and_match(seen, map, points, T_predicted, radius);
-            let observations = self.observations(seen, map, &matches.pairs);
+            let matches = self.project_and_match(seen, local, T_predicted, radius);
+            let observations = self.observations(seen, local, &matches.pairs);
             let rough = optimise_pose(&self.rig, &observations, T_predicted);
             (rough.count() >= self.config.min_inliers)
-                .then(|| self.settle(seen, map, points, &rough.T_cam_world))?
+                .then(|| self.settle(seen, local, &rough.T_cam_world))?
         })
     }
 
-    /// Matches points of the first few of `local` by descriptor alone, samples a pose and settles it
-    /// in all of `local`: for jumps that no prediction covers, and for places known from long ago.
+    /// Matches the nearest points by descriptor alone, samples a pose and settles it in the whole
+    /// local map: for jumps that no prediction covers, and for places known from long ago.
     #[allow(non_snake_case)]
-    pub fn track_by_looks(&self, seen: &Seen, map: &Map, local: &[usize]) -> Option<Placement> {
-        const NEAREST: usize = 3;
-        let recent = map.points_of(&local[..local.len().min(NEAREST)]);
-        let looks: Vec<Descriptor> = recent.iter().map(|id| map.points[id].descriptor).collect();
+    pub fn track_by_looks(&self, seen: &Seen, local: &LocalMap) -> Option<Placement> {
+        let nearest = &local.nearest;
+        let look = |id: &PointId| local.points[id].descriptor;
+        let looks: Vec<Descriptor> = nearest.iter().map(look).collect();
         let pairs: Vec<(PointId, usize)> = match_all(&looks, &seen.features[0], &self.config)
             .into_iter()
-            .map(|(i, feature)| (recent[i], feature))
+            .map(|(i, feature)| (nearest[i], feature))
             .collect();
-        let observations = self.observations(seen, map, &pairs);
+        let observations = self.observations(seen, local, &pairs);
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
         let T_sampled = sample_pose(&self.rig, &observations, self.config.min_inliers, &mut rng)?;
         let rough = optimise_pose(&self.rig, &observations, &T_sampled);
-        self.settle(seen, map, &map.points_of(local), &rough.T_cam_world)
+        self.settle(seen, local, &rough.T_cam_world)
     }
 
     /// The last, narrow match around a pose that is nearly right, with sightings aligned to a
@@ -155,27 +147,21 @@ impl Tracker {
     /// false ones were seen to explain half), and more than a few of the points in view. When a fast
     /// motion leaves few matches, these must agree better than half of them could by chance.
     #[allow(non_snake_case)]
-    fn settle(
-        &self,
-        seen: &Seen,
-        map: &Map,
-        points: &[PointId],
-        T_rough: &Se3,
-    ) -> Option<Placement> {
+    fn settle(&self, seen: &Seen, local: &LocalMap, T_rough: &Se3) -> Option<Placement> {
         const RADIUS: f64 = 6.0;
-        let matches = self.project_and_match(seen, map, points, T_rough, RADIUS);
+        let matches = self.project_and_match(seen, local, T_rough, RADIUS);
         let sightings: Vec<Sighting> = matches
             .pairs
             .iter()
             .map(|(point, feature)| Sighting {
                 point: *point,
                 feature: *feature,
-                at: self.align(seen, map, *point, *feature, T_rough),
+                at: self.align(seen, local, *point, *feature, T_rough),
             })
             .collect();
         let observations: Vec<Observation> = sightings
             .iter()
-            .map(|s| self.observation(seen, map, s.point, s.feature, &s.at))
+            .map(|s| self.observation(seen, local, s.point, s.feature, &s.at))
             .collect();
         let pose = optimise_pose(&self.rig, &observations, T_rough);
         let count = pose.count();
@@ -197,13 +183,13 @@ impl Tracker {
     /// Covariance of the twist `xi` (translation first) of which `exp(xi) T_cam_world` is the true
     /// pose of a placement, as its sightings tell. A pose without any is where it is by definition; one
     /// that they do not fix is known to a metre and a radian.
-    pub fn covariance(&self, seen: &Seen, map: &Map, placement: &Placement) -> Matrix6<f64> {
+    pub fn covariance(&self, seen: &Seen, local: &LocalMap, placement: &Placement) -> Matrix6<f64> {
         if placement.sightings.is_empty() {
             return Matrix6::zeros();
         }
         let mut information = Matrix6::zeros();
         for s in &placement.sightings {
-            let o = self.observation(seen, map, s.point, s.feature, &s.at);
+            let o = self.observation(seen, local, s.point, s.feature, &s.at);
             let p_cam = placement.T_cam_world * o.point;
             let jacobian = o.whiten(reprojection_jacobian(&self.rig, &p_cam));
             information += jacobian.transpose() * jacobian;
@@ -218,13 +204,13 @@ impl Tracker {
     fn align(
         &self,
         seen: &Seen,
-        map: &Map,
+        local: &LocalMap,
         point: PointId,
         feature: usize,
         T_cam_world: &Se3,
     ) -> Keypoint {
         let corner = seen.features[0].keypoints[feature];
-        let point = &map.points[&point];
+        let point = &local.points[&point];
         let depth = (T_cam_world * point.position).z;
         let guess = Vector2::new(corner.u, corner.v);
         let found = point
@@ -243,15 +229,13 @@ impl Tracker {
     fn project_and_match(
         &self,
         seen: &Seen,
-        map: &Map,
-        points: &[PointId],
+        local: &LocalMap,
         T_cam_world: &Se3,
         radius: f64,
     ) -> ProjectedMatches {
         let features = (&seen.features[0], &seen.grid);
         find_points(
-            map,
-            points,
+            local.points.iter(),
             T_cam_world,
             features,
             radius,
@@ -260,12 +244,17 @@ impl Tracker {
         )
     }
 
-    fn observations(&self, seen: &Seen, map: &Map, pairs: &[(PointId, usize)]) -> Vec<Observation> {
+    fn observations(
+        &self,
+        seen: &Seen,
+        local: &LocalMap,
+        pairs: &[(PointId, usize)],
+    ) -> Vec<Observation> {
         pairs
             .iter()
             .map(|(point, feature)| {
                 let at = &seen.features[0].keypoints[*feature];
-                self.observation(seen, map, *point, *feature, at)
+                self.observation(seen, local, *point, *feature, at)
             })
             .collect()
     }
@@ -273,13 +262,13 @@ impl Tracker {
     fn observation(
         &self,
         seen: &Seen,
-        map: &Map,
+        local: &LocalMap,
         point: PointId,
         feature: usize,
         at: &Keypoint,
     ) -> Observation {
         Observation::new(
-            map.points[&point].position,
+            local.points[&point].position,
             at,
             seen.disparities[feature],
             self.config.disparity_sigma,

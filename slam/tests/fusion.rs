@@ -18,7 +18,7 @@ fn run(source: &dyn StereoSource, fused: bool, frames: impl Iterator<Item = Ster
     if fused {
         slam = slam.with_sensors(source.sensors().unwrap());
     }
-    let reports: Vec<FrameReport> = frames.map(|f| slam.track(&f).unwrap()).collect();
+    let reports: Vec<FrameReport> = frames.map(|f| slam.track(f).unwrap()).collect();
     for r in reports
         .iter()
         .filter(|r| !r.tracked && !r.reason.contains("100 % black"))

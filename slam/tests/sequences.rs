@@ -7,7 +7,8 @@ use std::path::Path;
 use barchan_datasets::{StereoFrame, StereoSource, open};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
 use barchan_slam::{
-    Detector, FrameReport, LoopEvent, Map, Slam, SlamConfig, SlamError, SlamResult,
+    Detector, FrameReport, LoopEvent, Map, Mapped, MatchCounts, Slam, SlamConfig, SlamError,
+    SlamResult,
 };
 use block_matcher::BlockMatcher;
 
@@ -20,7 +21,11 @@ fn track(
     mut slam: Slam,
     frames: impl Iterator<Item = StereoFrame>,
 ) -> (Vec<FrameReport>, SlamResult) {
-    let reports: Vec<FrameReport> = frames.map(|f| slam.track(&f).unwrap()).collect();
+    let mut reports: Vec<FrameReport> = frames.map(|f| slam.track(f).unwrap()).collect();
+    if let (Some(last), Some(mapped)) = (reports.last_mut(), slam.settle().unwrap()) {
+        assert!(last.mapped.is_none());
+        last.mapped = Some(mapped);
+    }
     for lost in reports.iter().filter(|r| !r.tracked) {
         println!("{}: {}", lost.name, lost.reason);
     }
@@ -33,6 +38,11 @@ fn frames(source: &dyn StereoSource) -> impl Iterator<Item = StereoFrame> + '_ {
 
 fn tracked(reports: &[FrameReport]) -> usize {
     reports.iter().filter(|r| r.tracked).count()
+}
+
+fn loop_events(reports: &[FrameReport]) -> Vec<LoopEvent> {
+    let mapped = reports.iter().filter_map(|r| r.mapped.as_ref());
+    mapped.flat_map(|m| m.loops.clone()).collect()
 }
 
 /// Whether the map is of one part.
@@ -82,16 +92,12 @@ fn a_real_rover_with_dense_disparity_as_a_witness() {
     let score = score_of(&result, source.as_ref());
     assert!(score.ate_rmse_sim3 <= 0.06, "{score:?}");
     // Dense disparity at key frames, nowhere else; each rule decides something.
-    assert!(reports.iter().all(|r| r.keyframe == r.dense.is_some()));
-    let sum = |f: fn(&FrameReport) -> usize| {
-        let key = reports.iter().filter(|r| r.keyframe);
-        key.map(f).sum::<usize>()
-    };
-    let [ratio, gate, refused] = [
-        sum(|r| r.matches.ratio),
-        sum(|r| r.matches.gate),
-        sum(|r| r.matches.refused),
-    ];
+    let keyframes = reports.iter().filter(|r| r.keyframe).map(|r| r.frame);
+    let mapped: Vec<&Mapped> = reports.iter().filter_map(|r| r.mapped.as_ref()).collect();
+    assert!(keyframes.eq(mapped.iter().map(|m| m.frame)));
+    assert!(mapped.iter().all(|m| m.dense.is_some()));
+    let sum = |f: fn(&MatchCounts) -> usize| mapped.iter().map(|m| f(&m.matches)).sum::<usize>();
+    let [ratio, gate, refused] = [sum(|m| m.ratio), sum(|m| m.gate), sum(|m| m.refused)];
     println!("{ratio} by ratio, {gate} more by the gate, {refused} refused");
     assert!(gate > ratio / 20 && refused > 0);
 }
@@ -181,7 +187,7 @@ fn a_round_is_closed_and_the_drift_goes() {
         config.loops.enabled = enabled;
         let slam = Slam::new(*source.rig(), config, None);
         let (reports, result) = track(slam, images.iter().cloned());
-        let events: Vec<LoopEvent> = reports.into_iter().flat_map(|r| r.loops).collect();
+        let events: Vec<LoopEvent> = loop_events(&reports);
         (events, score_of(&result, source.as_ref()))
     };
     let (events, closed) = run(true);
@@ -204,7 +210,7 @@ fn nothing_is_seen_again_on_a_straight_line() {
     let spec = "synth:seed=1,route=straight,speed=1.5,frames=44,width=256,height=192";
     let source = open(spec).unwrap();
     let (reports, _) = track(slam(source.as_ref()), frames(source.as_ref()));
-    assert!(reports.iter().flat_map(|r| &r.loops).all(|e| !e.proved));
+    assert!(loop_events(&reports).iter().all(|e| !e.proved));
 }
 
 #[test]
@@ -268,7 +274,7 @@ fn a_frame_of_another_size_is_an_error_that_names_it() {
     let source = open("synth:frames=1,width=256,height=192").unwrap();
     let other = open("synth:frames=1,width=128,height=96").unwrap();
     let error = slam(source.as_ref())
-        .track(&other.frame(0).unwrap())
+        .track(other.frame(0).unwrap())
         .unwrap_err();
     assert!(
         matches!(

@@ -119,21 +119,20 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
         ));
     }
 
-    let log = slam.join("log.jsonl");
-    let text = std::fs::read_to_string(&log).with_context(|| log.display().to_string())?;
-    let frames: Vec<Value> = text
-        .lines()
-        .map(serde_json::from_str)
-        .collect::<Result<_, _>>()
-        .with_context(|| log.display().to_string())?;
+    let frames = read_lines(&slam.join("log.jsonl"))?;
+    // Other methods than `stereo` have no such file: their key frames are made at once.
+    let of_keyframes = slam.join("keyframes.jsonl");
+    let mapped = match of_keyframes.is_file() {
+        true => read_lines(&of_keyframes)?,
+        false => (frames.iter().filter(|f| f["keyframe"] == true))
+            .cloned()
+            .collect(),
+    };
+    let at = |f: &Value, key: &str| Some((f["frame"].as_f64()?, f[key].as_f64()?));
     let samples = |key: &str, only_keyframes: bool| {
         let is_keyframe = |f: &&Value| f["keyframe"] == true || !only_keyframes;
-        let at = |f: &Value| Some((f["frame"].as_f64()?, f[key].as_f64()?));
-        frames
-            .iter()
-            .filter(is_keyframe)
-            .filter_map(at)
-            .collect::<Vec<_>>()
+        let frames = frames.iter().filter(is_keyframe);
+        frames.filter_map(|f| at(f, key)).collect::<Vec<_>>()
     };
     let line = |name: &str, key: &str| Series {
         name: name.into(),
@@ -146,11 +145,14 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
         vertical: "ms".into(),
         plan: false,
         series: vec![
-            line("tracking and mapping", "ms_track"),
+            line("from images to pose", "ms_track"),
             Series {
                 name: "disparity, at key frames".into(),
                 style: Style::Marks,
-                samples: samples("ms_disparity", true),
+                samples: mapped
+                    .iter()
+                    .filter_map(|f| at(f, "ms_disparity"))
+                    .collect(),
             },
         ],
     });
@@ -204,6 +206,13 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
         before = tracked;
     }
     Ok(())
+}
+
+/// The values that a file has, one a line.
+fn read_lines(path: &Path) -> Result<Vec<Value>> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let values: Result<_, _> = text.lines().map(serde_json::from_str).collect();
+    values.with_context(|| path.display().to_string())
 }
 
 /// The way from above, over the truth where it is known. From above is along the vertical of the first camera.

@@ -56,11 +56,12 @@ impl MotionPrior {
         self.fusion.anchor();
     }
 
-    /// The map moved under the last placed frame.
+    /// The map moved under the last placed frame: what was at a place of the new world was at
+    /// `T_old_new` times it.
     #[allow(non_snake_case)]
-    pub fn corrected_to(&mut self, T_cam_world: Se3) {
+    pub fn map_moved(&mut self, T_old_new: &Se3) {
         if let Some((anchor, _)) = &mut self.anchor {
-            *anchor = T_cam_world;
+            *anchor *= T_old_new;
         }
     }
 

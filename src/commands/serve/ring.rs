@@ -131,17 +131,14 @@ impl Run {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn add(
-        &mut self,
-        report: &FrameReport,
-        left: &Rgb,
-        dense: Option<&DisparityMap>,
-    ) -> Result<()> {
+    pub fn add(&mut self, report: &FrameReport) -> Result<()> {
         self.summary.frames += 1;
         self.summary.tracked += usize::from(report.tracked);
-        self.summary.loops += report.loops.iter().filter(|l| l.proved).count();
-        if let Some(dense) = dense {
-            write_dense(&self.out, report.frame, left, dense)?;
+        if let Some(mapped) = &report.mapped {
+            self.summary.loops += mapped.loops.iter().filter(|l| l.proved).count();
+            if let Some(dense) = &mapped.dense {
+                write_dense(&self.out, mapped.frame, &mapped.left, dense)?;
+            }
         }
         let line = serde_json::to_string(report)?;
         writeln!(self.log, "{line}").context("log.jsonl")

@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 use barchan_datasets::{Rgb, StereoFrame, parse_rgb, parse_size};
 use barchan_geometry::{RectifiedRig, Se3};
 use barchan_infer::{DisparityEngine, DisparityMap, InferError, Rejection};
-use barchan_slam::Slam;
+use barchan_slam::{Slam, SlamConfig};
 use barchan_terrain::{Cloud, DepthLimits, VoxelMap};
 use serde_json::{Value, json};
 
@@ -305,20 +305,20 @@ impl Tracking {
         frame.index = self.frames;
         self.frames += 1;
         *locked(&self.handed) = Some(dense);
-        let mut report = self.slam.track(&frame)?;
-        let dense = report.dense.take();
+        let report = self.slam.track(frame)?;
         let pose = self.slam.pose().map(|p| p.T_world_cam);
-        if let (Some(dense), Some(pose)) = (&dense, pose) {
+        let mapped = report.mapped.as_ref();
+        let dense = mapped.and_then(|m| Some((&m.left, m.dense.as_ref()?)));
+        if let (Some((left, dense)), Some(pose)) = (dense, pose) {
             let limits = DepthLimits::default();
             let sigma = Some(&dense.sigma);
-            let cloud =
-                Cloud::from_disparity(&self.rig, &frame.left, &dense.disparity, sigma, &limits)?;
+            let cloud = Cloud::from_disparity(&self.rig, left, &dense.disparity, sigma, &limits)?;
             self.voxels.insert(&cloud.transform(&pose));
             self.first_pose.get_or_insert(pose);
             self.keyframes += 1;
         }
         if let Some(run) = &mut self.run
-            && let Err(e) = run.add(&report, &frame.left, dense.as_ref())
+            && let Err(e) = run.add(&report)
         {
             self.run = None;
             metrics.run_failed(&e);
@@ -333,7 +333,7 @@ impl Tracking {
             "reason": report.reason,
             "keyframe": report.keyframe,
             "inliers": report.inliers,
-            "loops": report.loops.iter().filter(|l| l.proved).count(),
+            "loops": mapped.map_or(0, |m| m.loops.iter().filter(|l| l.proved).count()),
             "T_world_cam": rows,
             "ms": report.ms_track,
         });
@@ -388,7 +388,12 @@ fn begin(
     handed: &Arc<Mutex<Option<DisparityMap>>>,
 ) -> Slam {
     let engine = Box::new(Handed(Arc::clone(handed)));
-    Slam::new(rig, settings.slam.clone(), Some(engine))
+    let config = SlamConfig {
+        // The disparity is there already, and an answer tells the pose with the map's last word.
+        map_lag: 0,
+        ..settings.slam.clone()
+    };
+    Slam::new(rig, config, Some(engine))
 }
 
 /// A bucket that fills at a rate and holds the pairs of one second.

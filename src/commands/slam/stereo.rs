@@ -1,12 +1,14 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{StereoSource, prefetch};
 use barchan_geometry::RectifiedRig;
 use barchan_slam::{
-    Detector, FusionCounts, LoopEvent, Map, MatchCounts, Slam, SlamConfig, SlamResult, Vocabulary,
+    Detector, FusionCounts, LoopEvent, Map, Mapped, MatchCounts, Slam, SlamConfig, SlamResult,
+    Vocabulary,
 };
 use barchan_terrain::{Cloud, CloudPoint};
 use serde::Serialize;
@@ -37,6 +39,9 @@ struct Summary {
     ms_track_median: f64,
     ms_track_p95: f64,
     ms_disparity_median: f64,
+    /// The rest of a key frame's way into the map.
+    ms_map_median: f64,
+    /// Frames a second from first to last, with reading and writing.
     fps: f64,
     matches: MatchCounts,
 }
@@ -74,13 +79,11 @@ pub fn run(
     }
     let frames = source.len();
     let bar = output.progress("slam", frames);
-    let (mut tracked, mut track_ms, mut disparity_ms, mut matches) =
-        (0, vec![], vec![], MatchCounts::default());
-    let mut total_ms = 0.0;
-    let (mut loops, mut found_again, mut carried) = (Vec::<LoopEvent>::new(), 0, 0);
+    let (mut tracked, mut track_ms, mut found_again, mut carried) = (0, vec![], 0, 0);
+    let mut map = MapRecord::default();
+    let started = Instant::now();
     for frame in prefetch(source, (0..frames).collect(), 4) {
-        let frame = frame?;
-        let mut report = slam.track(&frame)?;
+        let mut report = slam.track(frame?)?;
         if !report.tracked {
             let what = if report.carried {
                 "shows no place, and IMU and wheels carry on"
@@ -89,20 +92,9 @@ pub fn run(
             };
             output.notice(&format!("frame {} {what}: {}", report.name, report.reason));
         }
-        if let Some(dense) = report.dense.take() {
-            write_dense(&out, report.frame, &frame.left, &dense)?;
-            disparity_ms.push(report.ms_disparity);
-            matches.ratio += report.matches.ratio;
-            matches.gate += report.matches.gate;
-            matches.refused += report.matches.refused;
+        if let Some(mapped) = report.mapped.take() {
+            map.add(mapped, &out, output)?;
         }
-        report.loops.iter().filter(|l| l.proved).for_each(|event| {
-            output.notice(&format!(
-                "frame {} sees the place of frame {} again: {} map points agree, the loop moves it by {:.3} m",
-                event.frame, event.earlier_frame, event.map_points[1], event.moved
-            ));
-            loops.push(event.clone());
-        });
         if let Some(place) = report.found_again_at {
             found_again += 1;
             output.notice(&format!(
@@ -113,11 +105,15 @@ pub fn run(
         tracked += usize::from(report.tracked);
         carried += usize::from(report.carried);
         track_ms.push(report.ms_track);
-        total_ms += report.ms_track + report.ms_disparity;
         log.add(&report)?;
         bar.inc(1);
     }
+    if let Some(mapped) = slam.settle()? {
+        map.add(mapped, &out, output)?;
+    }
+    let seconds = started.elapsed().as_secs_f64();
     log.finish()?;
+    out.write("keyframes.jsonl", map.lines)?;
     bar.finish_and_clear();
     if tracked == 0 {
         bail!(
@@ -141,15 +137,15 @@ pub fn run(
     if let Some(reckoning) = reckoning {
         reckoning.write(&out, result.trajectory.poses.iter().map(|p| p.time))?;
     }
-    let map = result.map.to_bytes(&rig)?;
-    out.write("map.safetensors", map)?;
+    let bytes = result.map.to_bytes(&rig)?;
+    out.write("map.safetensors", bytes)?;
     let (ms_track_median, ms_track_p95) = percentiles(track_ms);
     let summary = Summary {
         frames,
         tracked,
         keyframes: result.keyframes.len(),
-        loops: loops.len(),
-        loop_events: loops,
+        loops: map.loops.len(),
+        loop_events: map.loops,
         submaps,
         found_again,
         carried,
@@ -158,9 +154,10 @@ pub fn run(
         points: result.map.points.len(),
         ms_track_median,
         ms_track_p95,
-        ms_disparity_median: percentiles(disparity_ms).0,
-        fps: 1e3 * frames as f64 / total_ms,
-        matches,
+        ms_disparity_median: percentiles(map.ms_disparity).0,
+        ms_map_median: percentiles(map.ms_map).0,
+        fps: frames as f64 / seconds,
+        matches: map.matches,
     };
     out.write_json("summary.json", &summary)?;
     out.finish()?;
@@ -176,19 +173,55 @@ pub fn run(
     });
     let text = format!(
         "{tracked} of {frames} frames tracked, {} key frames, {} loops, {} points; {ms_track_median:.1} ms a frame (p95 {ms_track_p95:.1}), \
-         {:.1} ms disparity a key frame, {:.1} frames/s\nstereo matches at key frames: {} by ratio, {} more by disparity, {} refused by disparity\n\
+         a key frame's disparity {:.1} ms and map {:.1} ms, {:.1} frames/s\nstereo matches at key frames: {} by ratio, {} more by disparity, {} refused by disparity\n\
          {fused}{}: trajectory.tum trajectory.kitti keyframes.tum map.ply",
         summary.keyframes,
         summary.loops,
         summary.points,
         summary.ms_disparity_median,
+        summary.ms_map_median,
         summary.fps,
-        matches.ratio,
-        matches.gate,
-        matches.refused,
+        summary.matches.ratio,
+        summary.matches.gate,
+        summary.matches.refused,
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// What the key frames came to.
+#[derive(Default)]
+struct MapRecord {
+    loops: Vec<LoopEvent>,
+    matches: MatchCounts,
+    ms_disparity: Vec<f64>,
+    ms_map: Vec<f64>,
+    /// A line of JSON each.
+    lines: String,
+}
+
+impl MapRecord {
+    /// Writes the images of a key frame, and notes what else is known of it.
+    fn add(&mut self, mapped: Mapped, out: &StagedDir, output: &Output) -> Result<()> {
+        if let Some(dense) = &mapped.dense {
+            write_dense(out, mapped.frame, &mapped.left, dense)?;
+            self.ms_disparity.push(mapped.ms_disparity);
+            self.matches.ratio += mapped.matches.ratio;
+            self.matches.gate += mapped.matches.gate;
+            self.matches.refused += mapped.matches.refused;
+        }
+        self.ms_map.push(mapped.ms_map);
+        self.lines += &serde_json::to_string(&mapped)?;
+        self.lines.push('\n');
+        for event in mapped.loops.into_iter().filter(|l| l.proved) {
+            output.notice(&format!(
+                "frame {} sees the place of frame {} again: {} map points agree, the loop moves it by {:.3} m",
+                event.frame, event.earlier_frame, event.map_points[1], event.moved
+            ));
+            self.loops.push(event);
+        }
+        Ok(())
+    }
 }
 
 fn configuration(args: &Args) -> Result<SlamConfig> {
