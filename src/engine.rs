@@ -16,6 +16,9 @@ const SHIPPED: [(&str, &[u8]); 2] = [
     ("tiny", include_bytes!("../checkpoints/tiny.safetensors")),
 ];
 
+/// Where no `--model` is given: real time on two cores where ONNX Runtime is installed.
+pub const DEFAULT_MODEL: &str = "rover";
+
 /// How engines run; flags that all commands with `--model` share.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct EngineSettings {

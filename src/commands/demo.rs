@@ -4,6 +4,7 @@ use anyhow::Result;
 use clap::Parser;
 
 use crate::commands::{data, eval, map, report, slam};
+use crate::engine::DEFAULT_MODEL;
 use crate::output::Output;
 
 /// The main job with nothing to set up: traverse, trajectory, terrain, report
@@ -16,7 +17,7 @@ pub struct Args {
     #[arg(long, value_name = "DATA")]
     data: Option<String>,
     /// What sees disparity: x.onnx, x.safetensors, sgm, bm or a shipped name
-    #[arg(long, default_value = "tiny")]
+    #[arg(long, default_value = DEFAULT_MODEL)]
     model: String,
     /// The directory that is written
     #[arg(long, value_name = "DIR", default_value = "demo")]

@@ -7,7 +7,7 @@ use barchan_train::DeviceName;
 use clap::Parser;
 use serde::Serialize;
 
-use crate::engine::load_net;
+use crate::engine::{DEFAULT_MODEL, load_net};
 use crate::output::Output;
 
 /// Say what is installed, what works, and how to get the rest
@@ -67,8 +67,8 @@ pub fn run(_: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
 /// Runs the shipped network on a small grey pair.
 fn try_shipped() -> Result<String> {
     let device = Device::flex();
-    let mut engine = BurnEngine::new(load_net("tiny", &device)?, device, "tiny");
+    let mut engine = BurnEngine::new(load_net(DEFAULT_MODEL, &device)?, device, DEFAULT_MODEL);
     let grey = barchan_datasets::Rgb::from_pixel(64, 48, image::Rgb([0.5; 3]));
     engine.disparity(&grey, &grey)?;
-    Ok("tiny".into())
+    Ok(DEFAULT_MODEL.into())
 }

@@ -11,7 +11,7 @@ use clap::Parser;
 use serde::Serialize;
 
 use crate::data::{Unchecked, open_checked};
-use crate::engine::{EngineSettings, load_engine};
+use crate::engine::{DEFAULT_MODEL, EngineSettings, load_engine};
 use crate::output::{Output, StagedDir, percentiles};
 use crate::preview::{disparity_beside_image, disparity_range, share};
 
@@ -19,7 +19,7 @@ use crate::preview::{disparity_beside_image, disparity_range, share};
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan infer --data images/ --model a.onnx --out out/\n  \
-    barchan infer --left l.png --right r.png --rig rig.toml --model tiny --out out/")]
+    barchan infer --left l.png --right r.png --rig rig.toml --model sgm --out out/")]
 pub struct Args {
     /// Stereo pairs: PATH or FORMAT:PATH
     #[arg(long, required_unless_present = "left", conflicts_with_all = ["left", "right", "rig"])]
@@ -35,7 +35,7 @@ pub struct Args {
     rig: Option<PathBuf>,
     /// x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
     /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
-    #[arg(long, default_value = "tiny")]
+    #[arg(long, default_value = DEFAULT_MODEL)]
     model: String,
     /// Only the frames named in this file, one name a line
     #[arg(long, value_name = "FILE")]

@@ -79,7 +79,7 @@ struct Settings {
     /// Start from these weights: a run, a .safetensors file or a shipped name
     #[arg(long, value_name = "MODEL")]
     init: Option<String>,
-    /// Which network [default: tiny]
+    /// Which network [default: rover]
     #[arg(long, value_enum)]
     preset: Option<PresetArg>,
     /// Where to compute [default: flex]
@@ -416,7 +416,7 @@ fn configure(
     loss: &LossArgs,
     augmentation: &AugmentationArgs,
 ) -> Result<TrainConfig> {
-    let mut config = TrainConfig::new(Preset::Tiny.config());
+    let mut config = TrainConfig::new(Preset::Rover.config());
     if let Some(path) = &args.config {
         let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
         config = config.overlay(&text, path)?;
@@ -427,7 +427,7 @@ fn configure(
     if args.finetune {
         config.schedule = Schedule::FINETUNE;
         config.crop = TrainConfig::FINETUNE_CROP;
-        let preset = args.preset.map_or(Preset::Tiny, Preset::from);
+        let preset = args.preset.map_or(Preset::Rover, Preset::from);
         config.init = Some(preset.name().to_owned());
     }
     if args.supervised {

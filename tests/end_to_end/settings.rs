@@ -45,7 +45,7 @@ fn the_papers_settings_by_default_then_a_file_then_flags() {
     assert_eq!(fine["crop"], toml::Value::from(vec![320, 384]));
     assert_eq!(number(&fine, "schedule", "epochs"), 1.0);
     assert_eq!(number(&fine, "schedule", "lr"), 1e-4);
-    assert_eq!(fine["init"].as_str(), Some("tiny"));
+    assert_eq!(fine["init"].as_str(), Some("rover"));
 
     // A run's own settings, changed by a part of a file and by flags.
     let whole = dir.path().join("fine/config.toml");

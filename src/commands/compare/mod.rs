@@ -19,7 +19,7 @@ use self::maps::{Ground, from_above};
 use crate::commands::eval::read_trajectory;
 use crate::commands::slam::{self, Method};
 use crate::data::{Unchecked, open_checked};
-use crate::engine::EngineSettings;
+use crate::engine::{DEFAULT_MODEL, EngineSettings};
 use crate::output::{Output, StagedDir};
 
 /// Compare methods and disparity engines on one sequence: a table, routes, maps, disparities
@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long = "method", value_enum, value_name = "METHOD")]
     methods: Vec<Method>,
     /// What sees disparity, as of `barchan slam`; may be given several times
-    #[arg(long = "model", value_name = "MODEL", default_values = ["tiny", "sgm", "bm"])]
+    #[arg(long = "model", value_name = "MODEL", default_values = [DEFAULT_MODEL, "sgm", "bm"])]
     models: Vec<String>,
     /// A run of `barchan slam` over the same data that takes part as it is; may be given several times
     #[arg(long = "run", value_name = "NAME=DIR")]

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
-use crate::engine::{EngineSettings, load_engine};
+use crate::engine::{DEFAULT_MODEL, EngineSettings, load_engine};
 use crate::output::{Output, StagedDir};
 use crate::preview::matches_over_pair;
 
@@ -29,7 +29,7 @@ pub struct Args {
     data: String,
     /// Dense disparity: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
     /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
-    #[arg(long, default_value = "tiny")]
+    #[arg(long, default_value = DEFAULT_MODEL)]
     model: String,
     /// The detector
     #[arg(long, value_enum, default_value_t = FeatureKind::Akaze)]

@@ -47,7 +47,7 @@ pub struct Args {
     /// The rig of all pairs [default: rig.toml]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// x.onnx, x.safetensors, a run of `barchan train`, a shipped name, sgm or bm [default: tiny]
+    /// x.onnx, x.safetensors, a run of `barchan train`, a shipped name, sgm or bm [default: rover]
     #[arg(long)]
     model: Option<String>,
     /// The first line of this file is a token that requests must bear; so is the variable BARCHAN_TOKEN

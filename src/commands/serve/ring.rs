@@ -5,9 +5,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use barchan_datasets::Rgb;
 use barchan_geometry::{RectifiedRig, Rig};
-use barchan_infer::DisparityMap;
 use barchan_slam::{FrameReport, SlamConfig, SlamResult};
 use serde::Serialize;
 

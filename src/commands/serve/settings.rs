@@ -8,6 +8,8 @@ use barchan_infer::Outlines;
 use barchan_slam::SlamConfig;
 use serde::{Deserialize, Serialize};
 
+use crate::engine::DEFAULT_MODEL;
+
 /// Everything that decides how the service runs: the TOML file. Paths in it start at its folder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -57,7 +59,7 @@ impl Default for Settings {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8484)),
             rig: "rig.toml".into(),
-            model: "tiny".into(),
+            model: DEFAULT_MODEL.into(),
             token_file: None,
             watch: None,
             consume: false,

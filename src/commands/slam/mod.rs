@@ -21,7 +21,7 @@ use serde::de::DeserializeOwned;
 
 use crate::commands::features::FeatureKind;
 use crate::data::{Unchecked, open_checked};
-use crate::engine::EngineSettings;
+use crate::engine::{DEFAULT_MODEL, EngineSettings};
 use crate::output::{Output, StagedDir};
 
 /// Track the camera through a sequence and gather dense key frames for `barchan map`
@@ -45,7 +45,7 @@ pub struct Args {
     method: Method,
     /// Disparity at key frames: x.onnx, x.safetensors, a run of `barchan train`, or a shipped name,
     /// or sgm or bm, which need no network (sgm:192 searches 192 disparities)
-    #[arg(long, default_value = "tiny")]
+    #[arg(long, default_value = DEFAULT_MODEL)]
     model: String,
     /// The run directory that is written
     #[arg(long, value_name = "DIR")]
