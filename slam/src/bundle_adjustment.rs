@@ -5,6 +5,7 @@ use nalgebra::{
     DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Matrix6x3, Point3, Vector3, Vector6,
 };
 
+use crate::block_cholesky::BlockCholesky;
 use crate::pose::{HUBER, Observation, huber_cost, huber_weight};
 
 /// A problem: poses of which some are fixed, points, and who sees what.
@@ -38,23 +39,16 @@ pub struct Summary {
 impl BundleAdjustment {
     /// Minimises the Huber loss of all reprojection errors by Levenberg-Marquardt.
     pub fn solve(&mut self, rig: &RectifiedRig, max_iterations: usize) -> Summary {
-        let free: Vec<Option<usize>> = self
-            .fixed
-            .iter()
-            .scan(0, |next, fixed| {
-                let slot = (!fixed).then_some(*next);
-                *next += usize::from(!fixed);
-                Some(slot)
-            })
-            .collect();
+        let free = self.numbered();
         let unknown_poses = free.iter().flatten().count();
         let by_point = self.observations_by_point();
+        let mut reduced = Reduced::new(unknown_poses, self.coupled_poses(&free, &by_point));
         let before = self.cost(rig);
         let (mut current, mut lambda, mut iterations) = (before, 1e-4, 0);
         while iterations < max_iterations {
             iterations += 1;
             let Some((pose_steps, point_steps)) =
-                self.step(rig, &free, unknown_poses, &by_point, lambda)
+                self.step(rig, &free, &mut reduced, &by_point, lambda)
             else {
                 lambda *= 10.0;
                 continue;
@@ -90,6 +84,16 @@ impl BundleAdjustment {
         }
     }
 
+    /// The number of each pose that is free.
+    fn numbered(&self) -> Vec<Option<usize>> {
+        let number = |next: &mut usize, fixed: &bool| {
+            let slot = (!fixed).then_some(*next);
+            *next += usize::from(!fixed);
+            Some(slot)
+        };
+        self.fixed.iter().scan(0, number).collect()
+    }
+
     /// Squared residual of each observation in standard deviations; infinite behind the camera.
     pub fn squared_residuals(&self, rig: &RectifiedRig) -> Vec<f64> {
         let squared = |(pose, point, o): &(usize, usize, Observation)| {
@@ -115,20 +119,35 @@ impl BundleAdjustment {
         by_point
     }
 
-    /// One damped Gauss-Newton step. Points are eliminated one by one; what is left is a dense
-    /// system over the free poses; points follow by back-substitution.
+    /// Free poses that see one point, all pairs of them.
+    fn coupled_poses<'a>(
+        &'a self,
+        free: &'a [Option<usize>],
+        by_point: &'a [Vec<usize>],
+    ) -> impl Iterator<Item = (usize, usize)> + 'a {
+        by_point.iter().flat_map(|sightings| {
+            let slots: Vec<usize> = (sightings.iter())
+                .filter_map(|i| free[self.observations[*i].0])
+                .collect();
+            let pairs =
+                |(k, a): (usize, &usize)| slots[..k].iter().map(|b| (*a, *b)).collect::<Vec<_>>();
+            slots.iter().enumerate().flat_map(pairs).collect::<Vec<_>>()
+        })
+    }
+
+    /// One damped Gauss-Newton step. Points are eliminated one by one; what is left is a system over
+    /// the free poses; points follow by back-substitution.
     fn step(
         &self,
         rig: &RectifiedRig,
         free: &[Option<usize>],
-        unknown_poses: usize,
+        reduced: &mut Reduced,
         by_point: &[Vec<usize>],
         lambda: f64,
     ) -> Option<Steps> {
-        let n = 6 * unknown_poses;
-        // Of symmetric matrices the lower triangle is filled, which is what the factorisation reads.
-        let mut reduced = DMatrix::<f64>::zeros(n, n);
-        let mut right = DVector::<f64>::zeros(n);
+        reduced.clear();
+        let unknown_poses = free.iter().flatten().count();
+        let mut right = vec![Vector6::<f64>::zeros(); unknown_poses];
         let mut poses = vec![(Matrix6::<f64>::zeros(), Vector6::<f64>::zeros()); unknown_poses];
         let rotations: Vec<Matrix3<f64>> = (self.T_cam_world.iter())
             .map(|pose| pose.rotation.to_rotation_matrix().into_inner())
@@ -173,11 +192,9 @@ impl BundleAdjustment {
             let blocks = first..coupled.len();
             for (a, w_a) in &coupled[blocks.clone()] {
                 let scaled = w_a * inverse;
-                let mut segment = right.fixed_rows_mut::<6>(6 * a);
-                segment -= scaled * g_point;
+                right[*a] -= scaled * g_point;
                 for (b, w_b) in coupled[blocks.clone()].iter().filter(|(b, _)| b <= a) {
-                    let mut block = reduced.fixed_view_mut::<6, 6>(6 * a, 6 * b);
-                    block -= scaled * w_b.transpose();
+                    reduced.add(*a, *b, &-(scaled * w_b.transpose()));
                 }
             }
             eliminated.push(Some((inverse, g_point, blocks)));
@@ -185,18 +202,10 @@ impl BundleAdjustment {
         for (slot, (mut h_pose, g_pose)) in poses.into_iter().enumerate() {
             let damping = (h_pose.diagonal() * lambda).add_scalar(1e-9);
             h_pose += Matrix6::from_diagonal(&damping);
-            let mut block = reduced.fixed_view_mut::<6, 6>(6 * slot, 6 * slot);
-            block += h_pose;
-            let mut segment = right.fixed_rows_mut::<6>(6 * slot);
-            segment += g_pose;
+            reduced.add(slot, slot, &h_pose);
+            right[slot] += g_pose;
         }
-        let solved = match n {
-            0 => right,
-            _ => reduced.cholesky()?.solve(&right),
-        };
-        let pose_steps: Vec<Vector6<f64>> = (0..unknown_poses)
-            .map(|k| solved.fixed_rows::<6>(6 * k).into_owned())
-            .collect();
+        let pose_steps = reduced.solve(&right)?;
         let point_steps = eliminated
             .into_iter()
             .map(|e| {
@@ -210,6 +219,57 @@ impl BundleAdjustment {
             })
             .collect();
         Some((pose_steps, point_steps))
+    }
+}
+
+/// The symmetric system over the poses that is left when points are eliminated: dense for the few of a local
+/// map, which all see the same points; sparse for a whole map, where few do.
+enum Reduced {
+    /// Of it the lower triangle is filled, which is what the factorisation reads.
+    Dense(DMatrix<f64>),
+    Sparse(BlockCholesky),
+}
+
+impl Reduced {
+    /// Most poses of a dense system.
+    const DENSE: usize = 48;
+
+    fn new(poses: usize, pairs: impl Iterator<Item = (usize, usize)>) -> Self {
+        match poses {
+            ..=Self::DENSE => Self::Dense(DMatrix::zeros(6 * poses, 6 * poses)),
+            _ => Self::Sparse(BlockCholesky::new(poses, pairs)),
+        }
+    }
+
+    fn clear(&mut self) {
+        match self {
+            Self::Dense(matrix) => matrix.fill(0.0),
+            Self::Sparse(matrix) => matrix.clear(),
+        }
+    }
+
+    /// Adds to the block at row `a` and column `b`, which is no greater.
+    fn add(&mut self, a: usize, b: usize, block: &Matrix6<f64>) {
+        match self {
+            Self::Dense(matrix) => {
+                let mut view = matrix.fixed_view_mut::<6, 6>(6 * a, 6 * b);
+                view += block;
+            }
+            Self::Sparse(matrix) => matrix.add(a, b, block),
+        }
+    }
+
+    /// `None` when it is not positive definite.
+    fn solve(&mut self, right: &[Vector6<f64>]) -> Option<Vec<Vector6<f64>>> {
+        let matrix = match self {
+            Self::Sparse(matrix) => return matrix.solve(right),
+            Self::Dense(_) if right.is_empty() => return Some(vec![]),
+            Self::Dense(matrix) => matrix,
+        };
+        let flat = DVector::from_iterator(6 * right.len(), right.iter().flatten().copied());
+        let solved = matrix.clone().cholesky()?.solve(&flat);
+        let block = |k: usize| solved.fixed_rows::<6>(6 * k).into_owned();
+        Some((0..right.len()).map(block).collect())
     }
 }
 
@@ -283,6 +343,32 @@ mod tests {
         let mut solved = truth.clone();
         solved.solve(&rig(), 5);
         assert!(distance(&solved, &truth) < 1e-9);
+    }
+
+    #[test]
+    fn the_sparse_system_gives_the_steps_of_the_dense_one() {
+        let mut problem = problem();
+        for (k, point) in problem.points.iter_mut().enumerate() {
+            point.z += 0.02 * (k as f64).sin();
+        }
+        let (free, by_point) = (problem.numbered(), problem.observations_by_point());
+        let pairs = || problem.coupled_poses(&free, &by_point);
+        let mut dense = Reduced::new(5, pairs());
+        let mut sparse = Reduced::Sparse(BlockCholesky::new(5, pairs()));
+        let steps = |reduced| {
+            let (poses, points) = problem
+                .step(&rig(), &free, reduced, &by_point, 1e-4)
+                .unwrap();
+            let poses = poses.iter().flatten().copied();
+            let all = poses.chain(points.iter().flatten().copied());
+            all.collect::<Vec<f64>>()
+        };
+        let (dense, sparse) = (steps(&mut dense), steps(&mut sparse));
+        let longest = dense.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
+        assert!(longest > 1e-3);
+        for (a, b) in dense.iter().zip(&sparse) {
+            assert!((a - b).abs() < 1e-9 * longest, "{a} {b}");
+        }
     }
 
     #[test]

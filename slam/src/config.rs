@@ -68,6 +68,8 @@ pub struct SlamConfig {
     pub map_lag: usize,
     /// Key frames that bundle adjustment moves.
     pub window: usize,
+    /// Whether bundle adjustment moves the whole map at the end.
+    pub adjust_all: bool,
     /// Most iterations of a bundle adjustment.
     pub ba_iterations: usize,
     /// Fewest map points that must agree with the pose of a frame that counts as tracked.
@@ -107,6 +109,7 @@ impl Default for SlamConfig {
             keyframe_ratio: 0.9,
             map_lag: 2,
             window: 8,
+            adjust_all: true,
             ba_iterations: 8,
             min_inliers: 15,
             min_match_share: 0.6,

@@ -1,5 +1,6 @@
 //! What a key frame adds to the map, and how the map then settles (Pire 2017, mapping thread).
 
+use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
@@ -111,7 +112,7 @@ impl Mapper {
         let keyframe = add_keyframe(map, &frame, &seen, &placement, submap);
         add_new_points(map, keyframe, &frame.left, &seen, rig, config);
         let local = map.around(keyframe, config.window);
-        adjust_locally(map, &local, rig, config);
+        adjust(map, &local, rig, config);
         cull(map, keyframe);
         let dense_disparity = dense.as_ref().map(|d| &d.disparity);
         let loops = (self.loops.as_mut()).map(|closer| closer.close(map, dense_disparity, way));
@@ -261,11 +262,25 @@ fn add_new_points(
     }
 }
 
+/// Bundle adjustment over the whole map; the first key frame of each part stays.
+pub(crate) fn adjust_all(map: &mut Map, rig: &RectifiedRig, config: &SlamConfig) {
+    let first = |(k, keyframe): (usize, &Keyframe)| {
+        let before = &map.keyframes[..k];
+        before.iter().all(|other| other.submap != keyframe.submap)
+    };
+    let keyframes = map.keyframes.iter().enumerate();
+    let free = keyframes
+        .filter(|k| !first(*k))
+        .map(|(k, _)| k)
+        .collect::<Vec<_>>();
+    adjust(map, &free, rig, config);
+}
+
 /// Bundle adjustment over key frames and what they see. Others that see the same points hold them in
 /// place; where there are none, the oldest does.
-fn adjust_locally(map: &mut Map, local: &[usize], rig: &RectifiedRig, config: &SlamConfig) {
+fn adjust(map: &mut Map, free: &[usize], rig: &RectifiedRig, config: &SlamConfig) {
     let ids: Vec<PointId> = map
-        .points_of(local)
+        .points_of(free)
         .into_iter()
         .filter(|id| map.points[id].observations.len() > 1)
         .collect();
@@ -278,7 +293,8 @@ fn adjust_locally(map: &mut Map, local: &[usize], rig: &RectifiedRig, config: &S
     let Some(oldest) = keyframes.first().copied() else {
         return;
     };
-    let border = keyframes.iter().any(|k| !local.contains(k));
+    let free: BTreeSet<usize> = free.iter().copied().collect();
+    let border = keyframes.iter().any(|k| !free.contains(k));
     let positions: Vec<Point3<f64>> = ids.iter().map(|id| map.points[id].position).collect();
     let mut problem = BundleAdjustment {
         T_cam_world: keyframes
@@ -288,7 +304,7 @@ fn adjust_locally(map: &mut Map, local: &[usize], rig: &RectifiedRig, config: &S
         fixed: keyframes
             .iter()
             .map(|k| match border {
-                true => !local.contains(k),
+                true => !free.contains(k),
                 false => *k == oldest,
             })
             .collect(),

@@ -15,7 +15,7 @@ use crate::fusion::{Fusion, FusionCounts, MotionPrior};
 use crate::local_map::LocalMap;
 use crate::loops::{LoopCloser, Way};
 use crate::map::{Keyframe, Map};
-use crate::mapping::{Candidate, Mapped, Mapper, Mapping};
+use crate::mapping::{Candidate, Mapped, Mapper, Mapping, adjust_all};
 use crate::tracker::{Placement, Tracker};
 use crate::uncertainty::pose_covariances;
 use crate::vocabulary::Vocabulary;
@@ -314,7 +314,10 @@ impl Slam {
         // A key frame that failed is not in the map.
         let _ = self.mapping.settle();
         let mut mapper = self.mapping.mapper();
-        let map = std::mem::take(&mut mapper.map);
+        let mut map = std::mem::take(&mut mapper.map);
+        if self.config.adjust_all {
+            adjust_all(&mut map, &self.rig, &self.config);
+        }
         let keyframe = |k: &Keyframe| {
             let pose = StampedPose {
                 time: k.time,

@@ -320,9 +320,21 @@ impl Filter {
 
     /// Corrects by the motion since the anchor that images show, in the IMU's frames. `false` when
     /// that is refused.
+    ///
+    /// Near ground that fills the image leaves a turn and a way that look alike undecided, and points that
+    /// are matched alike err alike: a motion may be off by several of the deviations that it states. It
+    /// then counts for as much less; refused is only what no such error explains.
     pub fn see(&mut self, motion: &Motion) -> bool {
+        const MOST_EXCESS: f64 = 25.0;
         let (residual, by_error) = self.motion_against(&motion.T_anchor_now);
-        self.correct(residual, by_error, motion.covariance, CHI2_6)
+        let mut noise = motion.covariance;
+        let spread = by_error * self.covariance * by_error.transpose() + noise;
+        let information = spread.try_inverse().unwrap_or_default();
+        let excess = residual.dot(&(information * residual)) / CHI2_6;
+        if excess > 1.0 && excess < MOST_EXCESS {
+            noise += spread * (excess * (1.0 + 1e-9) - 1.0);
+        }
+        self.correct(residual, by_error, noise, CHI2_6)
     }
 
     /// Measured minus expected motion as a twist in the frame of the anchor, and the derivative of
