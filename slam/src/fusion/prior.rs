@@ -1,6 +1,6 @@
 //! Where the map and the filter meet: poses of frames for the one, motions between them for the other.
 
-use barchan_geometry::Se3;
+use barchan_geometry::{Se3, se3};
 use nalgebra::Matrix6;
 
 use super::{Fusion, FusionConfig, FusionCounts, Motion, adjoint};
@@ -57,10 +57,13 @@ impl MotionPrior {
     }
 
     /// The map moved under the last placed frame: what was at a place of the new world was at
-    /// `T_old_new` times it.
+    /// `T_old_new` times it, seen from the newest key frame. Whether the frame moved with that is not
+    /// known better than that.
     #[allow(non_snake_case)]
     pub fn map_moved(&mut self, T_old_new: &Se3) {
-        if let Some((anchor, _)) = &mut self.anchor {
+        if let Some((anchor, covariance)) = &mut self.anchor {
+            let moved = se3::log(&(*anchor * T_old_new * anchor.inverse()));
+            *covariance += moved * moved.transpose();
             *anchor *= T_old_new;
         }
     }
