@@ -5,7 +5,8 @@ use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
-    CellStatistic, Levelling, MapConfig, StereoErrors, elevation_of_keyframes, map_keyframes,
+    CellStatistic, Levelling, MapConfig, NoiseModel, StereoErrors, elevation_of_keyframes,
+    map_keyframes,
 };
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
@@ -47,6 +48,9 @@ pub struct Args {
     /// Deviation of the disparity's error that all looks at a place share, pixels
     #[arg(long, default_value_t = StereoErrors::default().systematic, value_name = "PX")]
     systematic: f64,
+    /// How far the sensor is off: noise.toml of `barchan noise` [default: what the disparity says of itself]
+    #[arg(long, value_name = "FILE", conflicts_with = "systematic")]
+    sensor: Option<PathBuf>,
     /// Poses that replace those of the run, at the times of its key frames: TUM text, of the left
     /// camera in a world whose z is up. The products are then in that world
     #[arg(long, value_name = "FILE")]
@@ -129,6 +133,12 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         ..MapConfig::default()
     };
     config.limits.max_depth = args.max_depth;
+    let noise = args.sensor.as_deref().map(read_noise).transpose()?;
+    if let Some(NoiseModel::Stereo { disparity, .. }) = noise {
+        // What was measured of the sensor replaces what is assumed of all.
+        config.limits.default_sigma = disparity;
+        config.limits.min_sigma = disparity;
+    }
     if args.poses.is_some() {
         config.levelling = Levelling::World;
     }
@@ -141,9 +151,13 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
             .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
         config.levelling = Levelling::Known(motion);
     }
-    let errors = StereoErrors {
-        systematic: args.systematic,
-        ..StereoErrors::default()
+    let sensor = match noise {
+        Some(noise) => noise.sensor(slam.rig.fx, slam.rig.baseline),
+        None => StereoErrors {
+            systematic: args.systematic,
+            ..StereoErrors::default()
+        }
+        .sensor(&slam.rig),
     };
     let out = StagedDir::new(&args.out, "summary.json")?;
 
@@ -161,7 +175,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         &slam.rig,
         &map.T_level_world,
         &config.limits,
-        &errors,
+        sensor,
         args.clear_ghosts,
         &ElevationConfig {
             cell: map.cell,
@@ -237,6 +251,16 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// `noise.toml` of `barchan noise`.
+fn read_noise(file: &Path) -> Result<NoiseModel> {
+    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+    let cure = "expected what `barchan noise` writes: kind and its coefficients";
+    let model: NoiseModel =
+        toml::from_str(&text).with_context(|| format!("{}: {cure}", file.display()))?;
+    model.check().with_context(|| file.display().to_string())?;
+    Ok(model)
 }
 
 /// Poses, or places alone: what `barchan eval trajectory` reads, and `gnss.csv`.

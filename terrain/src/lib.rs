@@ -22,6 +22,7 @@ mod hillshade;
 mod las_file;
 mod level;
 mod map;
+mod noise;
 mod obstacles;
 mod pcd;
 mod ply;
@@ -40,6 +41,10 @@ pub use level::{Levelled, level};
 pub use map::{
     DenseKeyframe, Levelling, MapConfig, StereoErrors, TerrainMap, elevation_of_keyframes,
     map_keyframes,
+};
+pub use noise::{
+    Coefficient, LookSummary, NoiseBlock, NoiseForm, NoiseModel, NoiseStudy, PlaneLook, PlaneTruth,
+    ScenePlane, fit_plane, study_noise,
 };
 pub use obstacles::{Obstacle, obstacles};
 pub use raster::{CellStatistic, Dem, Grid, NODATA, Raster, dem};

@@ -243,9 +243,23 @@ impl Default for StereoErrors {
     }
 }
 
+impl StereoErrors {
+    /// The sensor model of a rig that errs so.
+    pub fn sensor(&self, rig: &RectifiedRig) -> SensorModel {
+        SensorModel::Stereo {
+            focal: rig.fx,
+            baseline: rig.baseline,
+            pixel: self.pixel,
+            systematic: self.systematic,
+            shared: self.shared,
+        }
+    }
+}
+
 /// Makes an elevation map of key frames, one at a time, in the frame that `T_level_world` maps the world
-/// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> covariance of points -> with that of
-/// the pose -> variance of heights ([`ElevationMap::add`]). With `clear_ghosts` what a key frame sees
+/// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> by `sensor` ([`StereoErrors::sensor`],
+/// [`NoiseModel::sensor`](crate::NoiseModel::sensor)) covariance of points -> with that of the pose -> variance of
+/// heights ([`ElevationMap::add`]). With `clear_ghosts` what a key frame sees
 /// through is removed ([`ElevationMap::clear_ghosts`]).
 ///
 /// # Errors
@@ -257,17 +271,10 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
     rig: &RectifiedRig,
     T_level_world: &Se3,
     limits: &DepthLimits,
-    errors: &StereoErrors,
+    sensor: SensorModel,
     clear_ghosts: bool,
     config: &ElevationConfig,
 ) -> Result<ElevationMap, E> {
-    let sensor = SensorModel::Stereo {
-        focal: rig.fx,
-        baseline: rig.baseline,
-        pixel: errors.pixel,
-        systematic: errors.systematic,
-        shared: errors.shared,
-    };
     // How the levelled frame's axes lie to the world's, for shift and rotation alike.
     let rotation = T_level_world.rotation.to_rotation_matrix();
     let mut turn = Matrix6::zeros();
