@@ -5,8 +5,8 @@ use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
-    CellStatistic, Levelling, MapConfig, NoiseModel, StereoErrors, elevation_of_keyframes,
-    map_keyframes,
+    CellStatistic, DenseKeyframe, Levelling, MapConfig, NoiseModel, StereoErrors, VoxelScene,
+    colour_gains, elevation_of_keyframes,
 };
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
@@ -24,10 +24,11 @@ use crate::slam_run::{RunKeyframe, SlamRun};
 pub struct Args {
     /// A run of `barchan slam`
     run: PathBuf,
-    /// Edge of a voxel, metres [default: from the size of a pixel on the ground]
+    /// Edge of a voxel, metres [default: half of the cell, rounded]
     #[arg(long, value_name = "M")]
     voxel: Option<f64>,
-    /// Edge of a cell of the DEM, metres [default: twice the voxel, rounded]
+    /// Edge of a cell of the DEM, metres [default: twice the voxel where that is given; else three times the
+    /// distance of neighbouring points on the ground, to 1, 2 or 5 times a power of ten]
     #[arg(long, value_name = "M")]
     cell: Option<f64>,
     /// Fewest points of a voxel that is kept
@@ -62,9 +63,12 @@ pub struct Args {
     /// Writes cloud.pcd as well
     #[arg(long)]
     pcd: bool,
-    /// Removes what later key frames see through
+    /// Removes what other key frames see through, from the cloud and the rasters
     #[arg(long)]
     clear_ghosts: bool,
+    /// Colours as the camera saw them: exposure and white balance of key frames are not made equal
+    #[arg(long)]
+    raw_colours: bool,
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -119,6 +123,10 @@ struct Summary {
     band_width: f64,
     /// Whether the bounds hold what the poses may be off.
     pose_covariance: bool,
+    /// Voxels that were removed because other key frames saw through them.
+    ghosts: usize,
+    /// Least and greatest gain of a key frame that was taken from its colours; none with --raw-colours.
+    gains: Option<[f64; 2]>,
     notices: Vec<String>,
 }
 
@@ -161,17 +169,34 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
     };
     let out = StagedDir::new(&args.out, "summary.json")?;
 
-    // The key frames are read twice: what is up is known when all were seen.
-    let bar = output.progress("map", 2 * keyframes.len());
-    let frames = || {
-        keyframes.iter().map(|k| {
+    // The key frames are read again and again rather than kept: what their gains are, what is a ghost and what is
+    // up is known when all were seen.
+    let passes = 2 + usize::from(args.clear_ghosts) + usize::from(!args.raw_colours);
+    let bar = output.progress("map", passes * keyframes.len());
+    let (bar, run) = (&bar, &slam);
+    let frames = |gains: &[[f64; 3]]| {
+        let gains = gains.to_vec();
+        keyframes.iter().enumerate().map(move |(i, k)| {
             bar.inc(1);
-            slam.read(k)
+            let keyframe = run.read(k)?;
+            Ok::<DenseKeyframe, anyhow::Error>(match gains.get(i) {
+                Some(gain) => keyframe.without_gain(gain),
+                None => keyframe,
+            })
         })
     };
-    let mut map = map_keyframes(frames(), &slam.rig, &config)?;
+    let gains = match args.raw_colours {
+        true => vec![],
+        false => colour_gains(frames(&[]), &slam.rig, &config)?,
+    };
+    let mut scene = VoxelScene::gather(frames(&gains), &slam.rig, &config)?;
+    let ghosts = match args.clear_ghosts {
+        true => scene.clear_ghosts(frames(&[]), &slam.rig, &config.limits)?,
+        false => 0,
+    };
+    let mut map = scene.into_terrain(&config)?;
     let elevation = elevation_of_keyframes(
-        frames(),
+        frames(&gains),
         &slam.rig,
         &map.T_level_world,
         &config.limits,
@@ -230,6 +255,8 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         elevation_cells,
         band_width,
         pose_covariance,
+        ghosts,
+        gains: range(&gains),
         notices: map.notices.clone(),
     };
     out.write_json("summary.json", &summary)?;
@@ -251,6 +278,13 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// Least and greatest of all gains; none of none.
+fn range(gains: &[[f64; 3]]) -> Option<[f64; 2]> {
+    let all = || gains.iter().flatten().copied();
+    let (least, greatest) = (all().reduce(f64::min)?, all().reduce(f64::max)?);
+    Some([least, greatest])
 }
 
 /// `noise.toml` of `barchan noise`.

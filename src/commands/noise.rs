@@ -385,10 +385,13 @@ fn by_tilt(rows: &[Row]) -> Vec<(i64, Vec<&Row>)> {
 
 fn noise_chart(rows: &[Row]) -> Chart {
     let mut series = vec![];
-    for (tilt, rows) in by_tilt(rows) {
+    let classes = by_tilt(rows);
+    let last = classes.len().saturating_sub(1);
+    for (k, (tilt, rows)) in classes.into_iter().enumerate() {
+        // As a share of depth: near looks, which count as much, would else lie on the axis.
         let samples = |value: &dyn Fn(&Row) -> f64| {
-            let mut samples: Vec<(f64, f64)> =
-                rows.iter().map(|r| (r.depth, 1e3 * value(r))).collect();
+            let of = |r: &&Row| (r.depth, 100.0 * value(r) / r.depth);
+            let mut samples: Vec<(f64, f64)> = rows.iter().map(of).collect();
             samples.sort_by(|a, b| a.0.total_cmp(&b.0));
             samples
         };
@@ -397,16 +400,19 @@ fn noise_chart(rows: &[Row]) -> Chart {
             style: Style::Marks,
             samples: samples(&|r| r.noise),
         });
-        series.push(Series {
-            name: format!("{tilt} degrees, model"),
-            style: Style::Line,
-            samples: samples(&|r| r.model),
-        });
+        // Lines of all would hide the marks.
+        if k == 0 || k == last {
+            series.push(Series {
+                name: format!("{tilt} degrees, model"),
+                style: Style::Line,
+                samples: samples(&|r| r.model),
+            });
+        }
     }
     Chart {
         title: "Noise along the line of sight".into(),
         horizontal: "depth (m)".into(),
-        vertical: "standard deviation (mm)".into(),
+        vertical: "standard deviation (% of depth)".into(),
         plan: false,
         series,
     }
@@ -416,12 +422,15 @@ fn error_chart(rows: &[Row]) -> Chart {
     let series = by_tilt(rows).into_iter().map(|(tilt, rows)| Series {
         name: format!("{tilt} degrees"),
         style: Style::Marks,
-        samples: rows.iter().map(|r| (r.depth, 1e3 * r.error)).collect(),
+        samples: rows
+            .iter()
+            .map(|r| (r.depth, 100.0 * r.error / r.depth))
+            .collect(),
     });
     Chart {
         title: "Systematic error along the line of sight".into(),
         horizontal: "depth (m)".into(),
-        vertical: "mean error (mm)".into(),
+        vertical: "mean error (% of depth)".into(),
         plan: false,
         series: series.collect(),
     }

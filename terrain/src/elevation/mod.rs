@@ -223,20 +223,36 @@ struct Window {
     corner: [i64; 2],
     /// Cells west to east and south to north.
     size: [usize; 2],
+    /// Where that cell is stored: its place modulo the size.
+    start: [usize; 2],
 }
 
 impl Window {
+    fn new(corner: [i64; 2], size: [usize; 2]) -> Self {
+        let start = [0, 1].map(|k| match size[k] {
+            0 => 0,
+            size => corner[k].rem_euclid(size as i64) as usize,
+        });
+        Self {
+            corner,
+            size,
+            start,
+        }
+    }
+
     /// Where a cell is stored; `None` outside. Cell (i, j) lies at (i mod width, j mod height): a move
     /// frees what leaves and keeps the rest in its place.
-    fn slot(&self, [i, j]: [i64; 2]) -> Option<usize> {
-        let inside = |k: i64, corner: i64, size: usize| k >= corner && k - corner < size as i64;
-        (inside(i, self.corner[0], self.size[0]) && inside(j, self.corner[1], self.size[1])).then(
-            || {
-                let column = i.rem_euclid(self.size[0] as i64) as usize;
-                let row = j.rem_euclid(self.size[1] as i64) as usize;
-                row * self.size[0] + column
-            },
-        )
+    fn slot(&self, place: [i64; 2]) -> Option<usize> {
+        let wrapped = |k: usize| {
+            // Below the corner is far beyond the size as well.
+            let from_corner = place[k].wrapping_sub(self.corner[k]) as u64;
+            (from_corner < self.size[k] as u64).then(|| {
+                // Divisions take longer than all the rest, and this is asked for every point.
+                let at = self.start[k] + from_corner as usize;
+                if at < self.size[k] { at } else { at - self.size[k] }
+            })
+        };
+        Some(wrapped(1)? * self.size[0] + wrapped(0)?)
     }
 
     /// All cells, row by row from the south-west.
@@ -320,13 +336,9 @@ impl ElevationMap {
     pub fn new(config: ElevationConfig) -> Result<Self, TerrainError> {
         positive("cell", config.cell)?;
         positive("gate_threshold", config.gate_threshold)?;
-        let window = Window {
-            corner: [0, 0],
-            size: [0, 0],
-        };
         Ok(Self {
             config,
-            window,
+            window: Window::new([0, 0], [0, 0]),
             cells: vec![],
             bin_of: vec![],
             sensors: vec![],
@@ -376,10 +388,7 @@ impl ElevationMap {
                 limit: self.config.max_cells,
             });
         }
-        let window = Window {
-            corner: low.map(|b| b as i64),
-            size: [width as usize, height as usize],
-        };
+        let window = Window::new(low.map(|b| b as i64), [width as usize, height as usize]);
         if window != self.window {
             let mut cells = vec![ElevationCell::EMPTY; cells as usize];
             for place in self.window.places() {
@@ -400,10 +409,11 @@ impl ElevationMap {
             return;
         }
         let old = self.window;
-        self.window.corner = [0, 1].map(|k| {
+        let corner = [0, 1].map(|k| {
             let middle = (centre[k] / self.config.cell).floor().clamp(-1e15, 1e15) as i64;
             middle - old.size[k] as i64 / 2
         });
+        self.window = Window::new(corner, old.size);
         if self.window == old {
             return;
         }
@@ -651,7 +661,7 @@ impl ElevationMap {
 
     /// The map as a north-up grid and its cells, row by row.
     pub fn raster(&self) -> (Grid, Vec<&ElevationCell>) {
-        let Window { corner, size } = self.window;
+        let Window { corner, size, .. } = self.window;
         let cell = self.config.cell;
         let grid = Grid {
             width: size[0],
