@@ -27,7 +27,7 @@ pub struct Args {
     /// Edge of a voxel, metres [default: half of the cell, rounded]
     #[arg(long, value_name = "M")]
     voxel: Option<f64>,
-    /// Edge of a cell of the DEM, metres [default: twice the voxel where that is given; else three times the
+    /// Edge of a cell of the DEM, metres [default: twice the voxel where that is given; else five times the
     /// distance of neighbouring points on the ground, to 1, 2 or 5 times a power of ten]
     #[arg(long, value_name = "M")]
     cell: Option<f64>,

@@ -30,6 +30,8 @@ struct Sighting {
     points: u32,
     /// Sum of linear light.
     linear_rgb: [f32; 3],
+    /// Sum of the logarithms of how far away its points were, metres.
+    range: f32,
 }
 
 /// Most sightings that are kept: 50 MB.
@@ -53,8 +55,8 @@ impl ColourGains {
         })
     }
 
-    /// Adds what the next key frame saw, in the world.
-    pub fn add(&mut self, cloud: &Cloud) {
+    /// Adds what the next key frame saw, in the world, from `eye`.
+    pub fn add(&mut self, cloud: &Cloud, eye: &Point3<f64>) {
         let keyframe = self.keyframes as u32;
         self.keyframes += 1;
         for p in &cloud.points {
@@ -71,10 +73,13 @@ impl ColourGains {
                     keyframe,
                     points: 0,
                     linear_rgb: [0.0; 3],
+                    range: 0.0,
                 });
             }
             if let Some(sighting) = sightings.last_mut() {
                 sighting.points += 1;
+                // Nothing is seen from nearer than a millimetre.
+                sighting.range += (p.position - eye).norm().max(1e-3).ln() as f32;
                 for (sum, c) in sighting.linear_rgb.iter_mut().zip(p.colour) {
                     *sum += srgb_to_linear(c) as f32;
                 }
@@ -89,8 +94,12 @@ impl ColourGains {
     /// added. Their geometric mean over key frames that are linked by common places is 1: what all have in common
     /// is nobody's gain. A key frame that shares no place with another has gains of 1.
     ///
-    /// `ln(colour) = ln(gain of the key frame) + ln(colour of the place)`, least squares with Tukey's weights: a
-    /// shadow that moved, a highlight and a wrong point are outliers.
+    /// `ln(colour) = ln(gain of the key frame) + ln(colour of the place) + b1 r + b2 r^2` with `r = ln(range)`, least
+    /// squares with Tukey's weights: a shadow that moved, a highlight and a wrong point are outliers. The range stands
+    /// for lenses that are darker in the corners and for ground that is brighter the flatter one looks at it. On a straight
+    /// drive, where each place comes nearer alike, that looks like a gain that grows from key frame to key frame, and
+    /// would pile up. What is likely decides: gains within 30 % or so, and coefficients of the range within 0.1. So a
+    /// steady change of light along a long way without return is not seen.
     pub fn solve(&self) -> Vec<[f64; 3]> {
         let mut gains = vec![[1.0; 3]; self.keyframes];
         for channel in 0..3 {
@@ -106,43 +115,43 @@ impl ColourGains {
         // In a fixed order, so that the same clouds give the same bits.
         let mut places: Vec<_> = self.places.iter().filter(|(_, s)| s.len() > 1).collect();
         places.sort_unstable_by_key(|(key, _)| **key);
-        let seen: Vec<Vec<(usize, f64)>> = places
+        let mut looks: Vec<Vec<Logarithm>> = places
             .iter()
-            .map(|(_, sightings)| {
-                let logarithm = |s: &Sighting| {
-                    let mean = f64::from(s.linear_rgb[channel]) / f64::from(s.points);
-                    (s.keyframe as usize, mean.ln())
-                };
-                sightings.iter().map(logarithm).collect()
-            })
+            .map(|(_, s)| s.iter().map(|s| s.logarithm(channel)).collect())
             .collect();
-        let mut weights: Vec<Vec<f64>> = seen.iter().map(|s| vec![1.0; s.len()]).collect();
-        let mut gains = DVector::zeros(self.keyframes);
+        // Ranges about their mean, so that their square says something else than they do.
+        let count = looks.iter().flatten().count().max(1) as f64;
+        let middle = looks.iter().flatten().map(|l| l.range).sum::<f64>() / count;
+        for look in looks.iter_mut().flatten() {
+            look.range -= middle;
+        }
+        let mut unknowns = DVector::zeros(self.keyframes + 2);
+        let mut deviation = 0.05;
         for _ in 0..ROUNDS {
-            gains = conjugate_gradients(&seen, &weights, self.keyframes);
-            let residuals: Vec<Vec<f64>> = (seen.iter().zip(&weights))
-                .map(|(seen, weights)| {
-                    let place = weighted_mean(seen, weights, |k, y| y - gains[k]);
-                    seen.iter().map(|&(k, y)| y - gains[k] - place).collect()
-                })
-                .collect();
-            let mut sizes: Vec<f64> = residuals.iter().flatten().map(|r| r.abs()).collect();
+            unknowns = conjugate_gradients(&looks, self.keyframes, deviation);
+            let mut residuals = vec![];
+            for looks in &looks {
+                let rest = |l: &Logarithm| l.value - l.modelled(&unknowns);
+                let place = weighted_mean(looks, rest);
+                residuals.extend(looks.iter().map(|l| rest(l) - place));
+            }
+            let mut sizes: Vec<f64> = residuals.iter().map(|r: &f64| r.abs()).collect();
             if sizes.is_empty() {
                 break;
             }
             let middle = sizes.len() / 2;
-            let deviation = 1.4826 * *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
-            // 4.685 deviations: Tukey's biweight at 95 % efficiency. The floor is a grey level's step.
-            let reach = 4.685 * deviation.max(2e-3);
-            for (weights, residuals) in weights.iter_mut().zip(&residuals) {
-                for (weight, residual) in weights.iter_mut().zip(residuals) {
-                    let share = (residual / reach).powi(2);
-                    // Not quite 0, so that no place loses all of its weight.
-                    *weight = (1.0 - share.min(1.0)).powi(2).max(1e-6);
-                }
+            let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+            // The floor is less than a grey level.
+            deviation = (1.4826 * *median).max(2e-3);
+            // Tukey's biweight at 95 % efficiency.
+            let reach = 4.685 * deviation;
+            for (look, residual) in looks.iter_mut().flatten().zip(residuals) {
+                let share = (residual / reach).powi(2).min(1.0);
+                // Not quite 0, so that no place loses all of its weight.
+                look.weight = (1.0 - share).powi(2).max(1e-6);
             }
         }
-        gains
+        unknowns.rows(0, self.keyframes).into_owned()
     }
 
     fn place(&self, p: &Point3<f64>) -> Option<[i32; 3]> {
@@ -167,52 +176,102 @@ impl ColourGains {
     }
 }
 
-fn weighted_mean(seen: &[(usize, f64)], weights: &[f64], value: impl Fn(usize, f64) -> f64) -> f64 {
+impl Sighting {
+    fn logarithm(&self, channel: usize) -> Logarithm {
+        let n = f64::from(self.points);
+        Logarithm {
+            keyframe: self.keyframe as usize,
+            value: (f64::from(self.linear_rgb[channel]) / n).ln(),
+            range: f64::from(self.range) / n,
+            weight: 1.0,
+        }
+    }
+}
+
+/// A sighting as the least squares see it.
+struct Logarithm {
+    keyframe: usize,
+    /// Of the light.
+    value: f64,
+    /// Of the range.
+    range: f64,
+    weight: f64,
+}
+
+impl Logarithm {
+    /// What gain and range make of it; the gains stand first, then the two coefficients of the range.
+    fn modelled(&self, unknowns: &DVector<f64>) -> f64 {
+        let k = unknowns.len() - 2;
+        unknowns[self.keyframe] + self.range * (unknowns[k] + self.range * unknowns[k + 1])
+    }
+
+    /// Adds its derivative, times `by`.
+    fn add_derivative(&self, by: f64, sums: &mut DVector<f64>) {
+        let k = sums.len() - 2;
+        sums[self.keyframe] += by;
+        sums[k] += by * self.range;
+        sums[k + 1] += by * self.range * self.range;
+    }
+}
+
+fn weighted_mean(looks: &[Logarithm], value: impl Fn(&Logarithm) -> f64) -> f64 {
     let (mut sum, mut total) = (0.0, 0.0);
-    for (&(k, y), w) in seen.iter().zip(weights) {
-        sum += w * value(k, y);
-        total += w;
+    for look in looks {
+        sum += look.weight * value(look);
+        total += look.weight;
     }
     sum / total
 }
 
-/// The gains of least squares, the colours of the places eliminated. The matrix is a graph's Laplacian, whose null space
-/// is a common gain of what is linked: begun at zero, conjugate gradients never enter it, which fixes the gauge.
-fn conjugate_gradients(
-    seen: &[Vec<(usize, f64)>],
-    weights: &[Vec<f64>],
-    keyframes: usize,
-) -> DVector<f64> {
-    // What is left of values after each place took its mean, summed by key frame.
-    let reduced = |value: &dyn Fn(usize, f64) -> f64| {
-        let mut sums = DVector::zeros(keyframes);
-        for (seen, weights) in seen.iter().zip(weights) {
-            let place = weighted_mean(seen, weights, value);
-            for (&(k, y), w) in seen.iter().zip(weights) {
-                sums[k] += w * (value(k, y) - place);
+/// Gains and coefficients of the range of least squares, the colours of the places eliminated: conjugate gradients,
+/// preconditioned by the diagonal. `deviation` is that of a sighting.
+fn conjugate_gradients(looks: &[Vec<Logarithm>], keyframes: usize, deviation: f64) -> DVector<f64> {
+    /// How far logarithms of gains and coefficients of the range are likely to be from 0.
+    const LIKELY: [f64; 2] = [0.3, 0.1];
+    // What is left of values after each place took its mean, against the derivatives.
+    let normal = |value: &dyn Fn(&Logarithm) -> f64| {
+        let mut sums = DVector::zeros(keyframes + 2);
+        for looks in looks {
+            let place = weighted_mean(looks, value);
+            for look in looks {
+                look.add_derivative(look.weight * (value(look) - place), &mut sums);
             }
         }
         sums
     };
-    let right = reduced(&|_, y| y);
-    let enough = 1e-16 * right.norm_squared();
-    let mut gains = DVector::zeros(keyframes);
+    let mut diagonal = DVector::zeros(keyframes + 2);
+    for look in looks.iter().flatten() {
+        diagonal[look.keyframe] += look.weight;
+        diagonal[keyframes] += look.weight * look.range.powi(2);
+        diagonal[keyframes + 1] += look.weight * look.range.powi(4);
+    }
+    let prior = DVector::from_fn(keyframes + 2, |k, _| {
+        (deviation / LIKELY[usize::from(k >= keyframes)]).powi(2)
+    });
+    diagonal += &prior;
+
+    let right = normal(&|look| look.value);
+    let enough = 1e-20 * right.component_div(&diagonal).dot(&right);
+    let mut unknowns = DVector::zeros(keyframes + 2);
     let mut residual = right;
-    let mut direction = residual.clone();
-    let mut squared = residual.norm_squared();
+    let mut direction = residual.component_div(&diagonal);
+    let mut squared = residual.dot(&direction);
     for _ in 0..10 * keyframes {
-        if squared <= enough {
+        // NaN ends it too.
+        if squared.is_nan() || squared <= enough {
             break;
         }
-        let image = reduced(&|k, _| direction[k]);
+        let mut image = normal(&|look| look.modelled(&direction));
+        image += prior.component_mul(&direction);
         let step = squared / direction.dot(&image);
-        gains += &direction * step;
+        unknowns += &direction * step;
         residual -= image * step;
-        let next = residual.norm_squared();
-        direction = &residual + &direction * (next / squared);
+        let conditioned = residual.component_div(&diagonal);
+        let next = residual.dot(&conditioned);
+        direction = conditioned + direction * (next / squared);
         squared = next;
     }
-    gains
+    unknowns
 }
 
 /// An image, sRGB in 0..=1, as it would be had its light not been multiplied by `gain`.
@@ -253,12 +312,27 @@ mod tests {
         [wave(0.9), wave(1.7), wave(2.3)]
     }
 
-    /// What a key frame sees of places from `start` on, through gains; one place in `astray` is of another colour.
-    fn view(start: i32, gain: [f64; 3], astray: f64, rng: &mut ChaCha8Rng) -> Cloud {
+    /// Where a key frame stands that sees twelve rows of places from `start` on: before them, or beyond, looking back.
+    fn eye(start: i32, back: bool) -> Point3<f64> {
+        Point3::new(f64::from(start) + if back { 15.0 } else { -3.0 }, 5.0, 2.0)
+    }
+
+    /// What it sees, through gains; a share `astray` of the places is of another colour. What is farther is brighter
+    /// by a power of the range.
+    fn view(
+        start: i32,
+        eye: &Point3<f64>,
+        gain: [f64; 3],
+        astray: f64,
+        power: f64,
+        rng: &mut ChaCha8Rng,
+    ) -> Cloud {
         let places = (start..start + 12).flat_map(|x| (0..10).map(move |y| (x, y)));
         let mut points = vec![];
         for (x, y) in places {
             let mut light = albedo(x, y);
+            let range = (Point3::new(f64::from(x), f64::from(y), 0.5) - eye).norm();
+            light = light.map(|l| l * (range / 8.0).powf(power));
             if rng.random_bool(astray) {
                 light = light.map(|l| 0.3 * l);
             }
@@ -303,12 +377,15 @@ mod tests {
     }
 
     #[test]
-    fn planted_gains_come_back_along_a_way_though_some_places_changed() {
+    fn planted_gains_come_back_along_a_way_and_home_though_some_places_changed() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let planted = planted(60);
         let mut gains = ColourGains::new(1.0).unwrap();
         for (k, gain) in planted.iter().enumerate() {
-            gains.add(&view(3 * k as i32, *gain, 0.1, &mut rng));
+            // From the middle on it looks back.
+            let start = 3 * (k.min(59 - k)) as i32;
+            let eye = eye(start, k >= 30);
+            gains.add(&view(start, &eye, *gain, 0.1, 0.1, &mut rng), &eye);
         }
         let found = gains.solve();
         let off = difference(&found, &planted);
@@ -321,14 +398,30 @@ mod tests {
     }
 
     #[test]
+    fn what_is_brighter_far_away_is_no_gain_that_grows_along_the_way() {
+        let mut rng = ChaCha8Rng::seed_from_u64(8);
+        let mut gains = ColourGains::new(1.0).unwrap();
+        for k in 0..60 {
+            let eye = eye(3 * k, false);
+            gains.add(&view(3 * k, &eye, [1.0; 3], 0.05, 0.2, &mut rng), &eye);
+        }
+        // Taken for gains it would be a factor of 1.03 a key frame, and of 6 over the way.
+        let found = gains.solve();
+        let off = difference(&found, &[[1.0; 3]; 60]);
+        println!("largest gain {:.2} % off", 100.0 * off);
+        assert!(off < 0.1, "{off}");
+    }
+
+    #[test]
     fn what_is_not_linked_keeps_its_colour() {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let mut gains = ColourGains::new(1.0).unwrap();
         let planted = [[1.4, 1.0, 0.8], [0.7, 1.0, 1.2]];
-        gains.add(&view(0, planted[0], 0.0, &mut rng));
-        gains.add(&view(2, planted[1], 0.0, &mut rng));
-        gains.add(&view(500, [1.3; 3], 0.0, &mut rng));
-        gains.add(&Cloud::default());
+        let near = eye(0, false);
+        gains.add(&view(0, &near, planted[0], 0.0, 0.0, &mut rng), &near);
+        gains.add(&view(2, &near, planted[1], 0.0, 0.0, &mut rng), &near);
+        gains.add(&view(500, &near, [1.3; 3], 0.0, 0.0, &mut rng), &near);
+        gains.add(&Cloud::default(), &near);
         let found = gains.solve();
         assert_eq!(&found[2..], [[1.0; 3]; 2]);
         assert!(difference(&found[..2], &planted) < 0.01);
@@ -340,7 +433,9 @@ mod tests {
         let planted = planted(12);
         let mut gains = ColourGains::new(1.0).unwrap();
         for (k, gain) in planted.iter().enumerate() {
-            gains.add(&view(3 * k as i32, *gain, 0.0, &mut rng));
+            let start = 3 * k.min(11 - k) as i32;
+            let eye = eye(start, k >= 6);
+            gains.add(&view(start, &eye, *gain, 0.0, 0.0, &mut rng), &eye);
             if k % 5 == 4 {
                 gains.thin();
             }

@@ -249,7 +249,11 @@ impl Window {
             (from_corner < self.size[k] as u64).then(|| {
                 // Divisions take longer than all the rest, and this is asked for every point.
                 let at = self.start[k] + from_corner as usize;
-                if at < self.size[k] { at } else { at - self.size[k] }
+                if at < self.size[k] {
+                    at
+                } else {
+                    at - self.size[k]
+                }
             })
         };
         Some(wrapped(1)? * self.size[0] + wrapped(0)?)
