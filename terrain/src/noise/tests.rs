@@ -32,9 +32,7 @@ fn look(plane: &ScenePlane, model: SensorModel, disparity: f64, rng: &mut ChaCha
             sigma: (disparity * z * z / (FOCAL * BASELINE)) as f32,
         };
         let covariance = model.covariance(&exact).random;
-        let root = covariance
-            .cholesky()
-            .map_or_else(|| Matrix3::zeros(), |c| c.l());
+        let root = covariance.cholesky().map_or_else(Matrix3::zeros, |c| c.l());
         let noise = root * Vector3::from_fn(|_, _| normal(rng));
         points.push(CloudPoint {
             position: exact.position + noise,
