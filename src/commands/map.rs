@@ -52,6 +52,10 @@ pub struct Args {
     /// How far the sensor is off: noise.toml of `barchan noise` [default: what the disparity says of itself]
     #[arg(long, value_name = "FILE", conflicts_with = "systematic")]
     sensor: Option<PathBuf>,
+    /// Fewest key frames that must have measured a cell of elevation.tif: what one gets wholly wrong nothing
+    /// contradicts. Of a run with fewer key frames, all of them
+    #[arg(long, default_value_t = 3)]
+    min_looks: u32,
     /// Poses that replace those of the run, at the times of its key frames: TUM text, of the left
     /// camera in a world whose z is up. The products are then in that world
     #[arg(long, value_name = "FILE")]
@@ -204,6 +208,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.clear_ghosts,
         &ElevationConfig {
             cell: map.cell,
+            min_looks: args.min_looks.min(keyframes.len() as u32),
             ..ElevationConfig::default()
         },
     )?;

@@ -95,6 +95,9 @@ pub struct ElevationConfig {
     /// 4: at the rim of what a scan sees, where the near hides the far, matching hangs points into
     /// the air, and how the ground goes on is not known.
     pub min_neighbours: usize,
+    /// Fewest measurements of a cell that [`ElevationMap::bounds`] and files call known. Default 1. What one look
+    /// gets wholly wrong nothing contradicts, and no bound holds it.
+    pub min_looks: u32,
     /// What happens where a later scan contradicts a cell. Default `widen`.
     pub contradiction: Contradiction,
     /// Variance that a cell gains when it is contradicted and kept, square metres. Default 9e-7.
@@ -122,6 +125,7 @@ impl Default for ElevationConfig {
             gate_threshold: 2.5,
             min_points: 5,
             min_neighbours: 4,
+            min_looks: 1,
             contradiction: Contradiction::default(),
             multi_height_noise: 9e-7,
             increase_height_alpha: 0.0,
@@ -147,6 +151,8 @@ pub struct ElevationCell {
     pub linear_rgb: [f32; 3],
     /// Points that fell into the cell.
     pub count: u32,
+    /// Measurements that were taken in: with `per-scan`, scans.
+    pub looks: u32,
     /// When it was last measured, seconds.
     pub time: f64,
     /// Of the measurements since the last clean-up, the lowest height and three deviations, metres.
@@ -163,6 +169,7 @@ impl ElevationCell {
         horizontal: [f64::NAN; 3],
         linear_rgb: [f32::NAN; 3],
         count: 0,
+        looks: 0,
         time: f64::NAN,
         lowest: f32::NAN,
         seen_from: 0,
@@ -574,6 +581,7 @@ impl ElevationMap {
                 systematic: m.systematic,
                 linear_rgb: m.linear_rgb,
                 count: m.points,
+                looks: 1,
                 ..*cell
             };
         } else {
@@ -612,6 +620,7 @@ impl ElevationMap {
             let quarrel = (doubt - 1.0) * (random + cell.systematic);
             cell.random = random.max(floor) + quarrel;
             cell.count = cell.count.saturating_add(m.points);
+            cell.looks = cell.looks.saturating_add(1);
             let share = m.points as f32 / cell.count as f32;
             for (mean, c) in cell.linear_rgb.iter_mut().zip(m.linear_rgb) {
                 *mean += share * (c - *mean);
@@ -680,6 +689,17 @@ impl ElevationMap {
         let slots = places.filter_map(|[i, j]| self.window.slot([corner[0] + i, corner[1] + j]));
         (grid, slots.map(|k| &self.cells[k]).collect())
     }
+
+    /// [`ElevationMap::raster`], where cells of fewer than [`ElevationConfig::min_looks`] are empty.
+    fn settled(&self) -> (Grid, Vec<&ElevationCell>) {
+        let (grid, mut cells) = self.raster();
+        for cell in &mut cells {
+            if cell.looks < self.config.min_looks {
+                *cell = &ElevationCell::EMPTY;
+            }
+        }
+        (grid, cells)
+    }
 }
 
 /// Bands of the file that [`ElevationMap::write`] makes.
@@ -702,7 +722,7 @@ impl ElevationMap {
     /// # Errors
     /// When the file cannot be written, or the map has no cell.
     pub fn write(&self, path: &Path, kind: BoundsKind) -> Result<(), TerrainError> {
-        let (grid, cells) = self.raster();
+        let (grid, cells) = self.settled();
         let mut bands: [Vec<f32>; 9] = Default::default();
         for (cell, bounds) in cells.into_iter().zip(self.bounds(kind)) {
             let [r, g, b] = match cell.is_known() {
