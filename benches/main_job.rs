@@ -7,7 +7,7 @@ use barchan_geometry::{Se3, se3};
 use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Rejection, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
 use barchan_slam::{BundleAdjustment, Observation, PoseEdge, PoseGraph, Slam, SlamConfig};
-use barchan_terrain::elevation::{ElevationConfig, ElevationMap, Scan, SensorModel};
+use barchan_terrain::elevation::{ElevationConfig, ElevationMap, Scan};
 use barchan_terrain::{Cloud, DepthLimits, StereoErrors, VoxelMap};
 use divan::Bencher;
 
@@ -198,18 +198,11 @@ fn bundle_adjustment(bencher: Bencher) {
 fn elevation_of_one_frame(bencher: Bencher) {
     let (cloud, pose, rig) = cloud();
     let mut map = ElevationMap::new(ElevationConfig::default()).expect("defaults are valid");
-    let errors = StereoErrors::default();
     let scan = Scan {
         cloud: &cloud,
         T_map_sensor: pose.T_world_cam,
         pose_covariance: None,
-        sensor: SensorModel::Stereo {
-            focal: rig.fx,
-            baseline: rig.baseline,
-            pixel: errors.pixel,
-            systematic: errors.systematic,
-            shared: errors.shared,
-        },
+        sensor: StereoErrors::default().sensor(&rig),
         time: pose.time,
     };
     bencher.bench_local(|| map.add_growing(&scan).is_ok());

@@ -5,7 +5,8 @@ use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
-    CellStatistic, Levelling, MapConfig, StereoErrors, elevation_of_keyframes, map_keyframes,
+    CellStatistic, DenseKeyframe, Levelling, MapConfig, NoiseModel, StereoErrors, VoxelScene,
+    colour_gains, elevation_of_keyframes,
 };
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
@@ -23,10 +24,11 @@ use crate::slam_run::{RunKeyframe, SlamRun};
 pub struct Args {
     /// A run of `barchan slam`
     run: PathBuf,
-    /// Edge of a voxel, metres [default: from the size of a pixel on the ground]
+    /// Edge of a voxel, metres [default: half of the cell, rounded]
     #[arg(long, value_name = "M")]
     voxel: Option<f64>,
-    /// Edge of a cell of the DEM, metres [default: twice the voxel, rounded]
+    /// Edge of a cell of the DEM, metres [default: twice the voxel where that is given; else five times the
+    /// distance of neighbouring points on the ground, to 1, 2 or 5 times a power of ten]
     #[arg(long, value_name = "M")]
     cell: Option<f64>,
     /// Fewest points of a voxel that is kept
@@ -47,6 +49,13 @@ pub struct Args {
     /// Deviation of the disparity's error that all looks at a place share, pixels
     #[arg(long, default_value_t = StereoErrors::default().systematic, value_name = "PX")]
     systematic: f64,
+    /// How far the sensor is off: noise.toml of `barchan noise` [default: what the disparity says of itself]
+    #[arg(long, value_name = "FILE", conflicts_with = "systematic")]
+    sensor: Option<PathBuf>,
+    /// Fewest key frames that must have measured a cell of elevation.tif: what one gets wholly wrong nothing
+    /// contradicts. Of a run with fewer key frames, all of them
+    #[arg(long, default_value_t = 3)]
+    min_looks: u32,
     /// Poses that replace those of the run, at the times of its key frames: TUM text, of the left
     /// camera in a world whose z is up. The products are then in that world
     #[arg(long, value_name = "FILE")]
@@ -58,9 +67,12 @@ pub struct Args {
     /// Writes cloud.pcd as well
     #[arg(long)]
     pcd: bool,
-    /// Removes what later key frames see through
+    /// Removes what other key frames see through, from the cloud and the rasters
     #[arg(long)]
     clear_ghosts: bool,
+    /// Colours as the camera saw them: exposure and white balance of key frames are not made equal
+    #[arg(long)]
+    raw_colours: bool,
     /// The directory that is written
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -115,6 +127,10 @@ struct Summary {
     band_width: f64,
     /// Whether the bounds hold what the poses may be off.
     pose_covariance: bool,
+    /// Voxels that were removed because other key frames saw through them.
+    ghosts: usize,
+    /// Least and greatest gain of a key frame that was taken from its colours; none with --raw-colours.
+    gains: Option<[f64; 2]>,
     notices: Vec<String>,
 }
 
@@ -129,6 +145,12 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         ..MapConfig::default()
     };
     config.limits.max_depth = args.max_depth;
+    let noise = args.sensor.as_deref().map(read_noise).transpose()?;
+    if let Some(NoiseModel::Stereo { disparity, .. }) = noise {
+        // What was measured of the sensor replaces what is assumed of all.
+        config.limits.default_sigma = disparity;
+        config.limits.min_sigma = disparity;
+    }
     if args.poses.is_some() {
         config.levelling = Levelling::World;
     }
@@ -141,30 +163,52 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
             .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
         config.levelling = Levelling::Known(motion);
     }
-    let errors = StereoErrors {
-        systematic: args.systematic,
-        ..StereoErrors::default()
+    let sensor = match noise {
+        Some(noise) => noise.sensor(slam.rig.fx, slam.rig.baseline),
+        None => StereoErrors {
+            systematic: args.systematic,
+            ..StereoErrors::default()
+        }
+        .sensor(&slam.rig),
     };
     let out = StagedDir::new(&args.out, "summary.json")?;
 
-    // The key frames are read twice: what is up is known when all were seen.
-    let bar = output.progress("map", 2 * keyframes.len());
-    let frames = || {
-        keyframes.iter().map(|k| {
+    // The key frames are read again and again rather than kept: what their gains are, what is a ghost and what is
+    // up is known when all were seen.
+    let passes = 2 + usize::from(args.clear_ghosts) + usize::from(!args.raw_colours);
+    let bar = output.progress("map", passes * keyframes.len());
+    let (bar, run) = (&bar, &slam);
+    let frames = |gains: &[[f64; 3]]| {
+        let gains = gains.to_vec();
+        keyframes.iter().enumerate().map(move |(i, k)| {
             bar.inc(1);
-            slam.read(k)
+            let keyframe = run.read(k)?;
+            Ok::<DenseKeyframe, anyhow::Error>(match gains.get(i) {
+                Some(gain) => keyframe.without_gain(gain),
+                None => keyframe,
+            })
         })
     };
-    let mut map = map_keyframes(frames(), &slam.rig, &config)?;
+    let gains = match args.raw_colours {
+        true => vec![],
+        false => colour_gains(frames(&[]), &slam.rig, &config)?,
+    };
+    let mut scene = VoxelScene::gather(frames(&gains), &slam.rig, &config)?;
+    let ghosts = match args.clear_ghosts {
+        true => scene.clear_ghosts(frames(&[]), &slam.rig, &config.limits)?,
+        false => 0,
+    };
+    let mut map = scene.into_terrain(&config)?;
     let elevation = elevation_of_keyframes(
-        frames(),
+        frames(&gains),
         &slam.rig,
         &map.T_level_world,
         &config.limits,
-        &errors,
+        sensor,
         args.clear_ghosts,
         &ElevationConfig {
             cell: map.cell,
+            min_looks: args.min_looks.min(keyframes.len() as u32),
             ..ElevationConfig::default()
         },
     )?;
@@ -216,6 +260,8 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         elevation_cells,
         band_width,
         pose_covariance,
+        ghosts,
+        gains: range(&gains),
         notices: map.notices.clone(),
     };
     out.write_json("summary.json", &summary)?;
@@ -237,6 +283,23 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// Least and greatest of all gains; none of none.
+fn range(gains: &[[f64; 3]]) -> Option<[f64; 2]> {
+    let all = || gains.iter().flatten().copied();
+    let (least, greatest) = (all().reduce(f64::min)?, all().reduce(f64::max)?);
+    Some([least, greatest])
+}
+
+/// `noise.toml` of `barchan noise`.
+fn read_noise(file: &Path) -> Result<NoiseModel> {
+    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+    let cure = "expected what `barchan noise` writes: kind and its coefficients";
+    let model: NoiseModel =
+        toml::from_str(&text).with_context(|| format!("{}: {cure}", file.display()))?;
+    model.check().with_context(|| file.display().to_string())?;
+    Ok(model)
 }
 
 /// Poses, or places alone: what `barchan eval trajectory` reads, and `gnss.csv`.

@@ -11,6 +11,7 @@ pub mod export;
 pub mod features;
 pub mod infer;
 pub mod map;
+pub mod noise;
 pub mod probe;
 pub mod raster;
 pub mod report;

@@ -18,12 +18,15 @@ pub mod elevation;
 mod error;
 mod fill;
 mod geotiff;
+mod ghosts;
 mod hillshade;
 mod las_file;
 mod level;
 mod map;
+mod noise;
 mod obstacles;
 mod pcd;
+mod photometry;
 mod ply;
 mod raster;
 mod rover;
@@ -38,10 +41,15 @@ pub use geotiff::{Crs, Sample, geotiff_bytes, write_geotiff};
 pub use hillshade::{Light, hillshade};
 pub use level::{Levelled, level};
 pub use map::{
-    DenseKeyframe, Levelling, MapConfig, StereoErrors, TerrainMap, elevation_of_keyframes,
-    map_keyframes,
+    DenseKeyframe, Levelling, MapConfig, StereoErrors, TerrainMap, VoxelScene, colour_gains,
+    elevation_of_keyframes, map_keyframes,
+};
+pub use noise::{
+    Coefficient, LookSummary, NoiseBlock, NoiseForm, NoiseModel, NoiseStudy, PlaneLook, PlaneTruth,
+    ScenePlane, fit_plane, study_noise,
 };
 pub use obstacles::{Obstacle, obstacles};
+pub use photometry::ColourGains;
 pub use raster::{CellStatistic, Dem, Grid, NODATA, Raster, dem};
 pub use rover::{RoverLayers, RoverLimits, rover_layers};
 pub use slope::{roughness, slope};

@@ -5,10 +5,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::elevation::{ElevationConfig, ElevationMap, Scan, SensorModel};
 use crate::error::positive;
+use crate::ghosts::Sightlines;
+use crate::photometry::{ColourGains, without_gain};
 use crate::raster::dem;
 use crate::{
     CellStatistic, Cloud, Dem, DepthLimits, Light, Raster, TerrainError, Voxel, VoxelMap,
-    hillshade, level,
+    fit_plane, hillshade, level,
 };
 
 /// A key frame whose disparity is known.
@@ -47,13 +49,14 @@ pub enum Levelling {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MapConfig {
-    /// Edge of a voxel, metres. Default: twice the size of a pixel on the ground, or the deviation of
-    /// depth if that is larger, at the median depth of the first key frame, rounded to 1, 2 or 5 times
-    /// a power of ten (0.02 m for a rover 0.3 m high; 0.1 m for a car).
+    /// Edge of a voxel, metres. Default: half of the cell, rounded likewise.
     pub voxel: Option<f64>,
     /// Fewest points of a voxel that is kept. Default 2.
     pub min_points: u32,
-    /// Edge of a cell of the DEM, metres. Default: twice the voxel, rounded likewise.
+    /// Edge of a cell of the DEM, metres. Default: twice the voxel where that is given; else five times the
+    /// median distance of neighbouring samples on the ground in the first key frame, so that one look puts
+    /// 25 points into a cell and the elevation map has enough of them; rounded to 1, 2 or 5 times a power of ten (0.02 m for a rover 0.3 m
+    /// high, 0.2 m for one of 0.8 m and for a car).
     pub cell: Option<f64>,
     /// How the points of a cell make its elevation. Default: their mean.
     pub statistic: CellStatistic,
@@ -115,12 +118,72 @@ impl TerrainMap {
     }
 }
 
+impl DenseKeyframe {
+    /// The key frame as it would have been seen with gains of 1; see [`colour_gains`].
+    pub fn without_gain(mut self, gain: &[f64; 3]) -> Self {
+        self.left = without_gain(&self.left, gain);
+        self
+    }
+
+    /// What it measured, in its camera frame.
+    fn cloud(&self, rig: &RectifiedRig, limits: &DepthLimits) -> Result<Cloud, TerrainError> {
+        Cloud::from_disparity(
+            rig,
+            &self.left,
+            &self.disparity,
+            self.sigma.as_ref(),
+            limits,
+        )
+    }
+}
+
+/// Red, green and blue gains of key frames, as exposure and white balance made them, in their order: the light of
+/// places that several key frames see is one (Hong 2021's clouds change colour with the weather).
+/// [`DenseKeyframe::without_gain`] takes a gain away. See [`ColourGains`] for what is assumed.
+///
+/// # Errors
+/// The first error of `keyframes`; when images and rig differ in size or a setting makes no sense.
+pub fn colour_gains<E: From<TerrainError>>(
+    keyframes: impl IntoIterator<Item = Result<DenseKeyframe, E>>,
+    rig: &RectifiedRig,
+    config: &MapConfig,
+) -> Result<Vec<[f64; 3]>, E> {
+    // Larger than voxels: what a pixel is off does not matter then, and every other pixel is enough.
+    const VOXELS: f64 = 4.0;
+    let limits = DepthLimits {
+        stride: 2 * config.limits.stride,
+        ..config.limits
+    };
+    let mut gains = None;
+    let mut empty = 0;
+    for keyframe in keyframes {
+        let k = keyframe?;
+        let cloud = k.cloud(rig, &limits)?.transform(&k.T_world_cam);
+        let gains = match &mut gains {
+            Some(gains) => gains,
+            None if cloud.points.is_empty() => {
+                empty += 1;
+                continue;
+            }
+            none => {
+                let seen = k.cloud(rig, &config.limits)?;
+                let mut gains = ColourGains::new(VOXELS * sizes(rig, &seen, config)[0])?;
+                (0..empty).for_each(|_| gains.add(&Cloud::default(), &Point3::origin()));
+                none.insert(gains)
+            }
+        };
+        gains.add(&cloud, &k.T_world_cam.translation.vector.into());
+    }
+    Ok(gains.map_or_else(|| vec![[1.0; 3]; empty], |g| g.solve()))
+}
+
 /// Makes terrain of key frames, one at a time (Hong 2021, 3.2.2): every pixel of known disparity is
 /// re-projected (eq. 6) and put into the world by its key frame's pose (eq. 7); voxels gather what
 /// falls into the same place and drop what is seen too seldom; the ground is levelled; cells of a grid
 /// take the elevation of their voxels.
 ///
-/// `keyframes` may come from an engine that runs while this function pulls: its error ends the map.
+/// `keyframes` may come from an engine that runs while this function pulls: its error ends the map. Whoever can
+/// read key frames twice may use [`VoxelScene`], which can look for ghosts in between.
 ///
 /// # Errors
 /// The first error of `keyframes`; when images and rig differ in size, a setting makes no sense, no
@@ -130,92 +193,160 @@ pub fn map_keyframes<E: From<TerrainError>>(
     rig: &RectifiedRig,
     config: &MapConfig,
 ) -> Result<TerrainMap, E> {
-    if let Some(cell) = config.cell {
-        positive("cell", cell)?;
-    }
-    let mut map = config.voxel.map(VoxelMap::new).transpose()?;
-    let mut first_pose = None;
-    let (mut count, mut points) = (0, 0);
-    for keyframe in keyframes {
-        let k = keyframe?;
-        let cloud =
-            Cloud::from_disparity(rig, &k.left, &k.disparity, k.sigma.as_ref(), &config.limits)?;
-        first_pose.get_or_insert(k.T_world_cam);
-        count += 1;
-        points += cloud.points.len();
-        if cloud.points.is_empty() {
-            continue;
+    Ok(VoxelScene::gather(keyframes, rig, config)?.into_terrain(config)?)
+}
+
+/// The voxels of key frames in their world, before anybody asks what is up.
+#[derive(Clone, Debug)]
+pub struct VoxelScene {
+    /// Voxels of enough points, in a fixed order.
+    voxels: Vec<Voxel>,
+    /// Edges of a voxel and of a cell, metres.
+    sizes: [f64; 2],
+    first_pose: Se3,
+    keyframes: usize,
+    points: usize,
+    notices: Vec<String>,
+}
+
+impl VoxelScene {
+    /// The first half of [`map_keyframes`].
+    ///
+    /// # Errors
+    /// As [`map_keyframes`].
+    pub fn gather<E: From<TerrainError>>(
+        keyframes: impl IntoIterator<Item = Result<DenseKeyframe, E>>,
+        rig: &RectifiedRig,
+        config: &MapConfig,
+    ) -> Result<Self, E> {
+        for (field, value) in [("voxel", config.voxel), ("cell", config.cell)] {
+            value.map_or(Ok(()), |value| positive(field, value))?;
         }
-        let map = match &mut map {
-            Some(map) => map,
-            none => none.insert(VoxelMap::new(suitable_voxel(
-                rig,
-                &cloud,
-                config.limits.stride,
-            ))?),
+        let mut gathered = None;
+        let mut first_pose = None;
+        let (mut count, mut points) = (0, 0);
+        for keyframe in keyframes {
+            let k = keyframe?;
+            let cloud = k.cloud(rig, &config.limits)?;
+            first_pose.get_or_insert(k.T_world_cam);
+            count += 1;
+            points += cloud.points.len();
+            if cloud.points.is_empty() {
+                continue;
+            }
+            let (map, _) = match &mut gathered {
+                Some(gathered) => gathered,
+                none => {
+                    let sizes = sizes(rig, &cloud, config);
+                    none.insert((VoxelMap::new(sizes[0])?, sizes))
+                }
+            };
+            map.insert(&cloud.transform(&k.T_world_cam));
+        }
+
+        let (Some((map, sizes)), Some(first_pose)) =
+            (gathered.filter(|(map, _)| !map.is_empty()), first_pose)
+        else {
+            return Err(nothing(count, config).into());
         };
-        map.insert(&cloud.transform(&k.T_world_cam));
-    }
-
-    let (Some(map), Some(first_pose)) = (map.filter(|m| !m.is_empty()), first_pose) else {
-        return Err(nothing(count, config).into());
-    };
-    let mut notices = Vec::new();
-    let mut voxels = map.voxels(config.min_points);
-    if voxels.len() < map.len() {
-        let dropped = map.len() - voxels.len();
-        notices.push(format!(
-            "{dropped} of {} voxels ({:.0} %) held fewer than {} points and were left out as noise",
-            map.len(),
-            100.0 * dropped as f64 / map.len() as f64,
-            config.min_points
-        ));
-    }
-    if voxels.is_empty() {
-        return Err(TerrainError::Empty(format!(
-            "none of {} voxels of {} m holds {} points\n  cure: larger voxels, or fewer points asked of each",
-            map.len(),
-            map.size(),
-            config.min_points
-        ))
-        .into());
-    }
-
-    let levelled = match config.levelling {
-        Levelling::Ground => {
-            let positions: Vec<Point3<f64>> = voxels.iter().map(|v| v.mean).collect();
-            let levelled = level(&positions, &first_pose);
-            notices.extend(levelled.notice);
-            levelled.T_level_world
+        let mut notices = Vec::new();
+        let voxels = map.voxels(config.min_points);
+        if voxels.len() < map.len() {
+            let dropped = map.len() - voxels.len();
+            notices.push(format!(
+                "{dropped} of {} voxels ({:.0} %) held fewer than {} points and were left out as noise",
+                map.len(),
+                100.0 * dropped as f64 / map.len() as f64,
+                config.min_points
+            ));
         }
-        Levelling::World => Se3::identity(),
-        Levelling::Known(known) => known,
-    };
-    for v in &mut voxels {
-        v.mean = levelled * v.mean;
+        if voxels.is_empty() {
+            return Err(TerrainError::Empty(format!(
+                "none of {} voxels of {} m holds {} points\n  cure: larger voxels, or fewer points asked of each",
+                map.len(),
+                map.size(),
+                config.min_points
+            ))
+            .into());
+        }
+        Ok(Self {
+            voxels,
+            sizes,
+            first_pose,
+            keyframes: count,
+            points,
+            notices,
+        })
     }
 
-    let cell = config
-        .cell
-        .unwrap_or_else(|| round_to_125(2.0 * map.size()));
-    let dem = dem(&voxels, cell, config.statistic, config.max_cells)?;
-    if dem.outliers > 0 {
-        notices.push(format!(
-            "{} points far outside the others were left out of the DEM",
-            dem.outliers
-        ));
+    /// Removes voxels that more key frames look through than see, if at least two do: what moved, and points that hang
+    /// in the air. From each voxel a ray is cast to each key frame that has it in its image. Returns how many went.
+    ///
+    /// `keyframes` are those that were gathered.
+    ///
+    /// # Errors
+    /// The first error of `keyframes`; when images and rig differ in size.
+    pub fn clear_ghosts<E: From<TerrainError>>(
+        &mut self,
+        keyframes: impl IntoIterator<Item = Result<DenseKeyframe, E>>,
+        rig: &RectifiedRig,
+        limits: &DepthLimits,
+    ) -> Result<usize, E> {
+        let middles: Vec<Point3<f64>> = self.voxels.iter().map(|v| v.mean).collect();
+        let mut sightlines = Sightlines::new(&middles, self.sizes[0]);
+        for keyframe in keyframes {
+            let k = keyframe?;
+            sightlines.look(&k.cloud(rig, limits)?, &k.T_world_cam, rig);
+        }
+        let before = self.voxels.len();
+        let mut ghosts = sightlines.ghosts().into_iter();
+        self.voxels.retain(|_| ghosts.next() != Some(true));
+        Ok(before - self.voxels.len())
     }
-    Ok(TerrainMap {
-        hillshade: hillshade(&dem.raster, &config.light),
-        dem,
-        T_level_world: levelled,
-        keyframes: count,
-        points,
-        voxel: map.size(),
-        cell,
-        voxels,
-        notices,
-    })
+
+    /// The second half of [`map_keyframes`].
+    ///
+    /// # Errors
+    /// When no voxel is left, or the grid would be absurdly large.
+    pub fn into_terrain(self, config: &MapConfig) -> Result<TerrainMap, TerrainError> {
+        let Self {
+            mut voxels,
+            sizes: [voxel, cell],
+            mut notices,
+            ..
+        } = self;
+        let levelled = match config.levelling {
+            Levelling::Ground => {
+                let positions: Vec<Point3<f64>> = voxels.iter().map(|v| v.mean).collect();
+                let levelled = level(&positions, &self.first_pose);
+                notices.extend(levelled.notice);
+                levelled.T_level_world
+            }
+            Levelling::World => Se3::identity(),
+            Levelling::Known(known) => known,
+        };
+        for v in &mut voxels {
+            v.mean = levelled * v.mean;
+        }
+        let dem = dem(&voxels, cell, config.statistic, config.max_cells)?;
+        if dem.outliers > 0 {
+            notices.push(format!(
+                "{} points far outside the others were left out of the DEM",
+                dem.outliers
+            ));
+        }
+        Ok(TerrainMap {
+            hillshade: hillshade(&dem.raster, &config.light),
+            dem,
+            T_level_world: levelled,
+            keyframes: self.keyframes,
+            points: self.points,
+            voxel,
+            cell,
+            voxels,
+            notices,
+        })
+    }
 }
 
 /// How the sensor of key frames may be off, where their disparity does not say it.
@@ -243,9 +374,23 @@ impl Default for StereoErrors {
     }
 }
 
+impl StereoErrors {
+    /// The sensor model of a rig that errs so.
+    pub fn sensor(&self, rig: &RectifiedRig) -> SensorModel {
+        SensorModel::Stereo {
+            focal: rig.fx,
+            baseline: rig.baseline,
+            pixel: self.pixel,
+            systematic: self.systematic,
+            shared: self.shared,
+        }
+    }
+}
+
 /// Makes an elevation map of key frames, one at a time, in the frame that `T_level_world` maps the world
-/// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> covariance of points -> with that of
-/// the pose -> variance of heights ([`ElevationMap::add`]). With `clear_ghosts` what a key frame sees
+/// to (see [`TerrainMap::T_level_world`]): sigma of the disparity -> by `sensor` ([`StereoErrors::sensor`],
+/// [`NoiseModel::sensor`](crate::NoiseModel::sensor)) covariance of points -> with that of the pose -> variance of
+/// heights ([`ElevationMap::add`]). With `clear_ghosts` what a key frame sees
 /// through is removed ([`ElevationMap::clear_ghosts`]).
 ///
 /// # Errors
@@ -257,17 +402,10 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
     rig: &RectifiedRig,
     T_level_world: &Se3,
     limits: &DepthLimits,
-    errors: &StereoErrors,
+    sensor: SensorModel,
     clear_ghosts: bool,
     config: &ElevationConfig,
 ) -> Result<ElevationMap, E> {
-    let sensor = SensorModel::Stereo {
-        focal: rig.fx,
-        baseline: rig.baseline,
-        pixel: errors.pixel,
-        systematic: errors.systematic,
-        shared: errors.shared,
-    };
     // How the levelled frame's axes lie to the world's, for shift and rotation alike.
     let rotation = T_level_world.rotation.to_rotation_matrix();
     let mut turn = Matrix6::zeros();
@@ -293,15 +431,36 @@ pub fn elevation_of_keyframes<E: From<TerrainError>>(
     Ok(map)
 }
 
-/// See [`MapConfig::voxel`].
-fn suitable_voxel(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
-    let median = |mut values: Vec<f64>| {
-        let middle = values.len() / 2;
-        *values.select_nth_unstable_by(middle, f64::total_cmp).1
-    };
-    let depth = median(cloud.points.iter().map(|p| p.position.z).collect());
-    let deviation = median(cloud.points.iter().map(|p| f64::from(p.sigma)).collect());
-    round_to_125((2.0 * stride as f64 * depth / rig.fx).max(deviation))
+/// Edges of voxels and cells: see [`MapConfig::cell`].
+fn sizes(rig: &RectifiedRig, cloud: &Cloud, config: &MapConfig) -> [f64; 2] {
+    /// Samples along the edge of a cell.
+    const SAMPLES: f64 = 5.0;
+    match (config.voxel, config.cell) {
+        (Some(voxel), Some(cell)) => [voxel, cell],
+        (Some(voxel), None) => [voxel, round_to_125(2.0 * voxel)],
+        (None, Some(cell)) => [round_to_125(0.5 * cell), cell],
+        (None, None) => {
+            let cell = round_to_125(SAMPLES * ground_spacing(rig, cloud, config.limits.stride));
+            [round_to_125(0.5 * cell), cell]
+        }
+    }
+}
+
+/// Median distance of neighbouring samples on the ground, metres: the root of the area that a pixel covers on the plane
+/// that fits the points, `z^3 / (fx fy h)` for a plane at the distance `h`.
+fn ground_spacing(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
+    let positions: Vec<Point3<f64>> = cloud.points.iter().map(|p| p.position).collect();
+    let plane = fit_plane(&positions);
+    let mut spacings: Vec<f64> = positions
+        .iter()
+        .map(|p| {
+            // Of no plane: as if it faced the camera.
+            let height = plane.map_or(p.z, |plane| plane.distance);
+            stride as f64 * (p.z.powi(3) / (rig.fx * rig.fy * height)).sqrt()
+        })
+        .collect();
+    let middle = spacings.len() / 2;
+    *spacings.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// The nearest, as a ratio, of 1, 2 and 5 times a power of ten.
@@ -333,6 +492,7 @@ fn nothing(keyframes: usize, config: &MapConfig) -> TerrainError {
 mod tests {
     use super::*;
     use crate::cloud::tests::{chequered, rig};
+    use crate::voxel::linear_to_srgb;
     use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
     /// A camera `height` above z = 0 at (x, y), looking along +x, pitched down.
@@ -528,6 +688,172 @@ mod tests {
         ] {
             assert!((round_to_125(value) - rounded).abs() < 1e-12, "{value}");
         }
+    }
+
+    #[test]
+    fn a_given_size_decides_the_other() {
+        let sized = |voxel, cell| {
+            let config = MapConfig {
+                voxel,
+                cell,
+                ..MapConfig::default()
+            };
+            let cloud = keyframe(&rig(), pose(0.0, 0.0, 0.5, 0.6), |_, _| 0.0)
+                .and_then(|k| k.cloud(&rig(), &config.limits));
+            sizes(&rig(), &cloud.unwrap(), &config)
+        };
+        assert_eq!(sized(Some(0.03), Some(0.04)), [0.03, 0.04]);
+        assert_eq!(sized(Some(0.05), None), [0.05, 0.1]);
+        assert_eq!(sized(None, Some(0.2)), [0.1, 0.2]);
+        // 25 points a cell: neither a sieve nor a sandwich.
+        let [voxel, cell] = sized(None, None);
+        assert!(
+            voxel < cell && (0.02..=0.1).contains(&cell),
+            "{voxel} {cell}"
+        );
+    }
+
+    /// A drive of eight key frames over flat ground; a box stands on it while the first three are taken. Key frames
+    /// have gains where these are given.
+    #[allow(non_snake_case)]
+    fn drive_past_a_ghost(gains: Option<&[[f64; 3]]>) -> Vec<DenseKeyframe> {
+        let rig = rig();
+        let on_box = |x: f64, y: f64| (1.0..1.25).contains(&x) && y.abs() < 0.12;
+        let frames = (0..8).map(|i| {
+            let ground = move |x: f64, y: f64| if i < 3 && on_box(x, y) { 0.2 } else { 0.0 };
+            let T_world_cam = pose(0.06 * f64::from(i), 0.0, 0.5, 0.5);
+            let mut k = keyframe(&rig, T_world_cam, ground).unwrap();
+            k.time = f64::from(i);
+            // What the ground looks like depends on where it is.
+            k.left = Rgb::from_fn(rig.width as u32, rig.height as u32, |u, v| {
+                let d = f64::from(k.disparity.get_pixel(u, v).0[0]);
+                let at = barchan_geometry::StereoPoint {
+                    u: f64::from(u),
+                    v: f64::from(v),
+                    d,
+                };
+                let light = rig.back_project(at).map_or([0.2; 3], |p| {
+                    let p = T_world_cam * p;
+                    let wave = |a: f64| 0.22 + 0.12 * (a * p.x).sin() * (0.8 * a * p.y).cos();
+                    [wave(23.0), wave(31.0), wave(41.0)]
+                });
+                let gain = gains.map_or([1.0; 3], |g| g[i as usize]);
+                let level = |c: usize| {
+                    f32::from(linear_to_srgb((light[c] * gain[c]).clamp(0.0, 1.0))) / 255.0
+                };
+                image::Rgb([level(0), level(1), level(2)])
+            });
+            k
+        });
+        frames.collect()
+    }
+
+    fn all(frames: &[DenseKeyframe]) -> impl Iterator<Item = Result<DenseKeyframe, TerrainError>> {
+        frames.iter().cloned().map(Ok)
+    }
+
+    #[test]
+    fn a_ghost_is_looked_through_and_goes_and_the_ground_and_a_wall_stay() {
+        let rig = rig();
+        let frames = drive_past_a_ghost(None);
+        // Depths as sure as disparities of 0.1 px: 1.4 cm at 1.2 m.
+        let config = MapConfig {
+            levelling: Levelling::World,
+            limits: DepthLimits {
+                default_sigma: 0.1,
+                min_sigma: 0.1,
+                ..DepthLimits::default()
+            },
+            ..fine()
+        };
+        let mut scene = VoxelScene::gather(all(&frames), &rig, &config).unwrap();
+        let high = |scene: &VoxelScene| scene.voxels.iter().filter(|v| v.mean.z > 0.05).count();
+        let (ghost, ground) = (high(&scene), scene.voxels.len() - high(&scene));
+        assert!(ghost > 50, "{ghost}");
+        let gone = scene
+            .clear_ghosts(all(&frames), &rig, &config.limits)
+            .unwrap();
+        let left = high(&scene);
+        println!("{ghost} voxels of the ghost, {left} left; {ground} of the ground, {gone} gone");
+        assert!(left * 20 < ghost, "{left} of {ghost}");
+        let kept = scene.voxels.len() - left;
+        assert!(kept * 100 > ground * 99, "{kept} of {ground}");
+        // What stands in all key frames is no ghost.
+        let standing: Vec<DenseKeyframe> = (0..8)
+            .map(|i| {
+                let wall = |x: f64, _: f64| if x > 1.3 { 0.3 } else { 0.0 };
+                keyframe(&rig, pose(0.06 * f64::from(i), 0.0, 0.5, 0.5), wall).unwrap()
+            })
+            .collect();
+        let mut scene = VoxelScene::gather(all(&standing), &rig, &config).unwrap();
+        let before = scene.voxels.len();
+        let gone = scene
+            .clear_ghosts(all(&standing), &rig, &config.limits)
+            .unwrap();
+        assert!(gone * 200 < before, "{gone} of {before}");
+    }
+
+    #[test]
+    fn colours_of_key_frames_with_planted_gains_agree() {
+        let rig = rig();
+        let gain = |i: f64| {
+            [
+                1.0 + 0.4 * (1.1 * i).sin(),
+                1.0 + 0.3 * (0.7 * i).cos(),
+                1.1 - 0.06 * i,
+            ]
+        };
+        let planted: Vec<[f64; 3]> = (0..8).map(|i| gain(f64::from(i))).collect();
+        let frames = drive_past_a_ghost(Some(&planted));
+        // The contrast of dark key frames falls below the limit in places.
+        let config = MapConfig {
+            levelling: Levelling::World,
+            limits: DepthLimits {
+                min_contrast: 0.0,
+                ..DepthLimits::default()
+            },
+            ..fine()
+        };
+        let gains = colour_gains(all(&frames), &rig, &config).unwrap();
+        // Up to a gain that all have in common.
+        for c in 0..3 {
+            let off: Vec<f64> = (gains.iter().zip(&planted))
+                .map(|(found, planted)| (found[c] / planted[c]).ln())
+                .collect();
+            let mean = off.iter().sum::<f64>() / off.len() as f64;
+            let worst = off.iter().fold(0.0, |w: f64, o| w.max((o - mean).abs()));
+            assert!(worst < 0.03, "channel {c}: {worst}");
+        }
+        // Voxels are as bright as the ground was without gains, but for what is common.
+        let brightness = |frames: &[DenseKeyframe], gains: Option<&[[f64; 3]]>| {
+            let freed = frames.iter().enumerate().map(|(i, k)| {
+                let k = k.clone();
+                Ok::<_, TerrainError>(match gains {
+                    Some(gains) => k.without_gain(&gains[i]),
+                    None => k,
+                })
+            });
+            let scene = VoxelScene::gather(freed, &rig, &config).unwrap();
+            let ground = scene.voxels.into_iter().filter(|v| v.mean.z < 0.01);
+            ground.map(|v| v.linear_rgb).collect::<Vec<_>>()
+        };
+        let truth = brightness(&drive_past_a_ghost(None), None);
+        let spread = |seen: &[nalgebra::Vector3<f64>]| {
+            assert_eq!(seen.len(), truth.len());
+            let ratios: Vec<f64> = seen
+                .iter()
+                .zip(&truth)
+                .map(|(a, b)| (a.x / b.x).ln())
+                .collect();
+            let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
+            (ratios.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / ratios.len() as f64).sqrt()
+        };
+        let (raw, even) = (
+            spread(&brightness(&frames, None)),
+            spread(&brightness(&frames, Some(&gains))),
+        );
+        println!("deviation of colour {raw:.3} as seen, {even:.3} without gains");
+        assert!(even < 0.02 && raw > 5.0 * even, "{raw} {even}");
     }
 
     #[test]

@@ -1,3 +1,4 @@
+use std::collections::hash_map::Entry;
 use std::sync::LazyLock;
 
 use nalgebra::{Point3, Vector3};
@@ -46,21 +47,33 @@ impl VoxelMap {
     /// Points that are not finite, or more than two thousand million cubes away from the origin, are
     /// passed over.
     pub fn insert(&mut self, cloud: &Cloud) {
-        for p in &cloud.points {
-            let Some(key) = self.key(&p.position) else {
+        let levels = &*SRGB_TO_LINEAR;
+        let mut points = cloud.points.iter().peekable();
+        while let Some(first) = points.next() {
+            let Some(key) = self.key(&first.position) else {
                 continue;
             };
-            let rgb = Vector3::from(p.colour.map(srgb_to_linear));
-            let empty = Voxel {
-                count: 0,
-                mean: p.position,
-                linear_rgb: rgb,
+            // Neighbours in an image are neighbours in space: those of one cube are summed before it is looked up.
+            let colour = |p: &CloudPoint| Vector3::from(p.colour.map(|c| levels[usize::from(c)]));
+            let mut run = Voxel {
+                count: 1,
+                mean: first.position,
+                linear_rgb: colour(first),
             };
-            let voxel = self.voxels.entry(key).or_insert(empty);
-            voxel.count = voxel.count.saturating_add(1);
-            let share = 1.0 / f64::from(voxel.count);
-            voxel.mean += (p.position - voxel.mean) * share;
-            voxel.linear_rgb += (rgb - voxel.linear_rgb) * share;
+            while let Some(p) = points.next_if(|p| self.key(&p.position) == Some(key)) {
+                run.count += 1;
+                run.mean += p.position.coords;
+                run.linear_rgb += colour(p);
+            }
+            let n = f64::from(run.count);
+            run.mean /= n;
+            run.linear_rgb /= n;
+            match self.voxels.entry(key) {
+                Entry::Vacant(vacant) => {
+                    vacant.insert(run);
+                }
+                Entry::Occupied(mut known) => known.get_mut().merge(&run),
+            }
         }
     }
 
@@ -105,6 +118,14 @@ impl VoxelMap {
 }
 
 impl Voxel {
+    /// Takes the points of another in.
+    fn merge(&mut self, other: &Self) {
+        self.count = self.count.saturating_add(other.count);
+        let share = f64::from(other.count) / f64::from(self.count);
+        self.mean += (other.mean - self.mean) * share;
+        self.linear_rgb += (other.linear_rgb - self.linear_rgb) * share;
+    }
+
     /// The voxel as a point of a cloud. No deviation is known: that of the mean of correlated
     /// estimates is not their number's.
     pub fn to_point(&self) -> CloudPoint {

@@ -9,6 +9,7 @@ mod faults;
 mod fusion;
 mod help;
 mod methods;
+mod noise;
 mod program;
 mod serve;
 mod settings;

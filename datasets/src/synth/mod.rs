@@ -341,13 +341,14 @@ impl Synth {
     }
 }
 
-/// Opens what follows `synth:`, a traverse or `scenes,...`.
+/// Opens what follows `synth:`, a traverse, `scenes,...` or `planes,...`.
 ///
 /// # Errors
 /// As [`Synth::parse`] and [`RandomScenes::parse`].
 pub fn open(spec: &str) -> Result<Box<dyn StereoSource>, DataError> {
     match spec.split_once(',').unwrap_or((spec, "")) {
         ("scenes", rest) => Ok(Box::new(RandomScenes::parse(rest)?)),
+        ("planes", rest) => Ok(Box::new(RandomScenes::planes(rest)?)),
         _ => Ok(Box::new(Synth::parse(spec)?)),
     }
 }

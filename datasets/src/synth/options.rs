@@ -37,7 +37,8 @@ dust=0            specks of dust on each lens
 rectified=true    false: images of a distorted, crooked rig, rectified on reading
 sensor_noise=true false: IMU, odometry and GNSS without noise and bias
 synth:scenes      random shapes instead of a traverse: seed, frames, width, height, baseline, noise,
-                  and clutter=1, 0 for a few large things with rich texture";
+                  and clutter=1, 0 for a few large things with rich texture
+synth:planes      flat walls at five tilts and growing distances, for `barchan noise`: the options of scenes";
 
 /// How a place looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

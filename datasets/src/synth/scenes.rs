@@ -26,6 +26,8 @@ pub struct RandomScenes {
     options: Options,
     rig: RectifiedRig,
     materials: Vec<Texture<3>>,
+    /// One wall without end a frame, and nothing else: see [`RandomScenes::planes`].
+    only_walls: bool,
 }
 
 /// Side of the materials' textures.
@@ -51,6 +53,20 @@ impl RandomScenes {
                 .collect(),
             rig,
             options,
+            only_walls: false,
+        })
+    }
+
+    /// Flat walls for the study of a sensor's noise, one a frame: tilts of 0, 15, 30, 45 and 60 degrees at each of
+    /// the distances, which go from a disparity of 20 % of the width to one of 2 %. The options are those of
+    /// [`RandomScenes::parse`].
+    ///
+    /// # Errors
+    /// When an option is unknown or out of range; the message names it.
+    pub fn planes(spec: &str) -> Result<Self, DataError> {
+        Ok(Self {
+            only_walls: true,
+            ..Self::parse(spec)?
         })
     }
 
@@ -61,8 +77,10 @@ impl RandomScenes {
         }
         let mut rng = ChaCha8Rng::seed_from_u64(self.options.seed);
         rng.set_stream(index as u64);
-        let clutter = self.options.clutter;
-        let shapes = Shapes::random(&self.rig, &self.materials, clutter, &mut rng);
+        let shapes = match self.only_walls {
+            true => Shapes::wall(&self.rig, &self.materials, index, self.len(), &mut rng),
+            false => Shapes::random(&self.rig, &self.materials, self.options.clutter, &mut rng),
+        };
         Ok((shapes, rng))
     }
 
@@ -459,6 +477,38 @@ impl Stage<'_> {
 }
 
 impl<'a> Shapes<'a> {
+    /// Wall `index` of `count`; see [`RandomScenes::planes`].
+    fn wall(
+        rig: &RectifiedRig,
+        materials: &'a [Texture<3>],
+        index: usize,
+        count: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Self {
+        const TILTS: usize = 5;
+        let rows = count.div_ceil(TILTS);
+        let farther = (index / TILTS) as f64 / rows.saturating_sub(1).max(1) as f64;
+        let distance = rig.fx * rig.baseline / (0.2 * 0.1f64.powf(farther) * rig.width as f64);
+        let tilt = (15.0 * (index % TILTS) as f64).to_radians();
+        // About the image's horizontal axis, in which it sees less: 60 degrees do not reach the horizon.
+        let up = if rng.random_bool(0.5) { tilt } else { -tilt };
+        Self {
+            shapes: vec![Shape {
+                body: Body::Plane,
+                centre: Vector3::new(0.0, 0.0, distance),
+                radius: f64::INFINITY,
+                axes: *Rotation3::from_axis_angle(&Vector3::x_axis(), up).matrix(),
+                material: LEAVES * rng.random_range(0..MATERIALS / LEAVES),
+                texel: distance / rig.fx * rng.random_range(0.7..1.5),
+                contrast: 1.0,
+                tint: Vector3::repeat(1.0),
+            }],
+            materials,
+            to_lamp: -Vector3::z(),
+            ambient: 0.5,
+        }
+    }
+
     fn random(
         rig: &RectifiedRig,
         materials: &'a [Texture<3>],

@@ -59,7 +59,8 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         "synth" => Some(""),
         other => other.strip_prefix("synth:"),
     };
-    let scenes = options.is_some_and(|options| options.split(',').next() == Some("scenes"));
+    let kind = options.and_then(|options| options.split(',').next());
+    let scenes = matches!(kind, Some("scenes" | "planes"));
     let data = match options {
         Some(options) if random_scenes && !scenes => format!("synth:scenes,{options}"),
         None if random_scenes => {

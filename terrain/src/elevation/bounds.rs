@@ -32,9 +32,10 @@ pub struct Bounds {
 const ELLIPSE_95: f64 = 2.486;
 
 impl ElevationMap {
-    /// Heights and bounds of the cells of [`ElevationMap::raster`], in its order.
+    /// Heights and bounds of the cells of [`ElevationMap::raster`], in its order; NaN of cells that were measured less
+    /// often than [`ElevationConfig::min_looks`](super::ElevationConfig::min_looks).
     pub fn bounds(&self, kind: BoundsKind) -> Vec<Bounds> {
-        let (grid, cells) = self.raster();
+        let (grid, cells) = self.settled();
         let index = |column: usize, row: usize| row * grid.width + column;
         let places = (0..grid.height).flat_map(|row| (0..grid.width).map(move |c| (c, row)));
         places

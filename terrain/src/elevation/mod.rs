@@ -95,6 +95,9 @@ pub struct ElevationConfig {
     /// 4: at the rim of what a scan sees, where the near hides the far, matching hangs points into
     /// the air, and how the ground goes on is not known.
     pub min_neighbours: usize,
+    /// Fewest measurements of a cell that [`ElevationMap::bounds`] and files call known. Default 1. What one look
+    /// gets wholly wrong nothing contradicts, and no bound holds it.
+    pub min_looks: u32,
     /// What happens where a later scan contradicts a cell. Default `widen`.
     pub contradiction: Contradiction,
     /// Variance that a cell gains when it is contradicted and kept, square metres. Default 9e-7.
@@ -122,6 +125,7 @@ impl Default for ElevationConfig {
             gate_threshold: 2.5,
             min_points: 5,
             min_neighbours: 4,
+            min_looks: 1,
             contradiction: Contradiction::default(),
             multi_height_noise: 9e-7,
             increase_height_alpha: 0.0,
@@ -147,6 +151,8 @@ pub struct ElevationCell {
     pub linear_rgb: [f32; 3],
     /// Points that fell into the cell.
     pub count: u32,
+    /// Measurements that were taken in: with `per-scan`, scans.
+    pub looks: u32,
     /// When it was last measured, seconds.
     pub time: f64,
     /// Of the measurements since the last clean-up, the lowest height and three deviations, metres.
@@ -163,6 +169,7 @@ impl ElevationCell {
         horizontal: [f64::NAN; 3],
         linear_rgb: [f32::NAN; 3],
         count: 0,
+        looks: 0,
         time: f64::NAN,
         lowest: f32::NAN,
         seen_from: 0,
@@ -223,20 +230,40 @@ struct Window {
     corner: [i64; 2],
     /// Cells west to east and south to north.
     size: [usize; 2],
+    /// Where that cell is stored: its place modulo the size.
+    start: [usize; 2],
 }
 
 impl Window {
+    fn new(corner: [i64; 2], size: [usize; 2]) -> Self {
+        let start = [0, 1].map(|k| match size[k] {
+            0 => 0,
+            size => corner[k].rem_euclid(size as i64) as usize,
+        });
+        Self {
+            corner,
+            size,
+            start,
+        }
+    }
+
     /// Where a cell is stored; `None` outside. Cell (i, j) lies at (i mod width, j mod height): a move
     /// frees what leaves and keeps the rest in its place.
-    fn slot(&self, [i, j]: [i64; 2]) -> Option<usize> {
-        let inside = |k: i64, corner: i64, size: usize| k >= corner && k - corner < size as i64;
-        (inside(i, self.corner[0], self.size[0]) && inside(j, self.corner[1], self.size[1])).then(
-            || {
-                let column = i.rem_euclid(self.size[0] as i64) as usize;
-                let row = j.rem_euclid(self.size[1] as i64) as usize;
-                row * self.size[0] + column
-            },
-        )
+    fn slot(&self, place: [i64; 2]) -> Option<usize> {
+        let wrapped = |k: usize| {
+            // Below the corner is far beyond the size as well.
+            let from_corner = place[k].wrapping_sub(self.corner[k]) as u64;
+            (from_corner < self.size[k] as u64).then(|| {
+                // Divisions take longer than all the rest, and this is asked for every point.
+                let at = self.start[k] + from_corner as usize;
+                if at < self.size[k] {
+                    at
+                } else {
+                    at - self.size[k]
+                }
+            })
+        };
+        Some(wrapped(1)? * self.size[0] + wrapped(0)?)
     }
 
     /// All cells, row by row from the south-west.
@@ -320,13 +347,9 @@ impl ElevationMap {
     pub fn new(config: ElevationConfig) -> Result<Self, TerrainError> {
         positive("cell", config.cell)?;
         positive("gate_threshold", config.gate_threshold)?;
-        let window = Window {
-            corner: [0, 0],
-            size: [0, 0],
-        };
         Ok(Self {
             config,
-            window,
+            window: Window::new([0, 0], [0, 0]),
             cells: vec![],
             bin_of: vec![],
             sensors: vec![],
@@ -376,10 +399,7 @@ impl ElevationMap {
                 limit: self.config.max_cells,
             });
         }
-        let window = Window {
-            corner: low.map(|b| b as i64),
-            size: [width as usize, height as usize],
-        };
+        let window = Window::new(low.map(|b| b as i64), [width as usize, height as usize]);
         if window != self.window {
             let mut cells = vec![ElevationCell::EMPTY; cells as usize];
             for place in self.window.places() {
@@ -400,10 +420,11 @@ impl ElevationMap {
             return;
         }
         let old = self.window;
-        self.window.corner = [0, 1].map(|k| {
+        let corner = [0, 1].map(|k| {
             let middle = (centre[k] / self.config.cell).floor().clamp(-1e15, 1e15) as i64;
             middle - old.size[k] as i64 / 2
         });
+        self.window = Window::new(corner, old.size);
         if self.window == old {
             return;
         }
@@ -560,6 +581,7 @@ impl ElevationMap {
                 systematic: m.systematic,
                 linear_rgb: m.linear_rgb,
                 count: m.points,
+                looks: 1,
                 ..*cell
             };
         } else {
@@ -598,6 +620,7 @@ impl ElevationMap {
             let quarrel = (doubt - 1.0) * (random + cell.systematic);
             cell.random = random.max(floor) + quarrel;
             cell.count = cell.count.saturating_add(m.points);
+            cell.looks = cell.looks.saturating_add(1);
             let share = m.points as f32 / cell.count as f32;
             for (mean, c) in cell.linear_rgb.iter_mut().zip(m.linear_rgb) {
                 *mean += share * (c - *mean);
@@ -651,7 +674,7 @@ impl ElevationMap {
 
     /// The map as a north-up grid and its cells, row by row.
     pub fn raster(&self) -> (Grid, Vec<&ElevationCell>) {
-        let Window { corner, size } = self.window;
+        let Window { corner, size, .. } = self.window;
         let cell = self.config.cell;
         let grid = Grid {
             width: size[0],
@@ -665,6 +688,17 @@ impl ElevationMap {
         let places = rows.flat_map(|j| (0..size[0] as i64).map(move |i| [i, j]));
         let slots = places.filter_map(|[i, j]| self.window.slot([corner[0] + i, corner[1] + j]));
         (grid, slots.map(|k| &self.cells[k]).collect())
+    }
+
+    /// [`ElevationMap::raster`], where cells of fewer than [`ElevationConfig::min_looks`] are empty.
+    fn settled(&self) -> (Grid, Vec<&ElevationCell>) {
+        let (grid, mut cells) = self.raster();
+        for cell in &mut cells {
+            if cell.looks < self.config.min_looks {
+                *cell = &ElevationCell::EMPTY;
+            }
+        }
+        (grid, cells)
     }
 }
 
@@ -688,7 +722,7 @@ impl ElevationMap {
     /// # Errors
     /// When the file cannot be written, or the map has no cell.
     pub fn write(&self, path: &Path, kind: BoundsKind) -> Result<(), TerrainError> {
-        let (grid, cells) = self.raster();
+        let (grid, cells) = self.settled();
         let mut bands: [Vec<f32>; 9] = Default::default();
         for (cell, bounds) in cells.into_iter().zip(self.bounds(kind)) {
             let [r, g, b] = match cell.is_known() {

@@ -581,6 +581,27 @@ fn both_kinds_of_bounds_agree_on_flat_ground_that_did_not_move() {
 }
 
 #[test]
+fn what_was_seen_too_seldom_has_no_bounds() {
+    let config = ElevationConfig {
+        min_looks: 2,
+        ..plain(0.1)
+    };
+    let mut map = ElevationMap::square(config, 2.0).unwrap();
+    let [once, twice] = [point(-0.45, 0.05, 0.3), point(0.45, 0.05, 0.1)];
+    map.add(&scan(&cloud([once, twice]), upright(0.01), 0.0));
+    let known = |map: &ElevationMap| {
+        let bounds = map.bounds(BoundsKind::Sigma3);
+        bounds.iter().filter(|b| !b.height.is_nan()).count()
+    };
+    assert_eq!(known(&map), 0);
+    map.add(&scan(&cloud([twice]), upright(0.01), 1.0));
+    assert_eq!(known(&map), 1);
+    // What was seen once is kept for what comes.
+    assert!(map.at(-0.45, 0.05).unwrap().is_known());
+    assert_eq!(map.at(0.45, 0.05).unwrap().looks, 2);
+}
+
+#[test]
 fn what_is_seen_through_is_removed_and_walls_stay() {
     let ground = || {
         (0..60).flat_map(|i| {
