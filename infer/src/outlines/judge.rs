@@ -4,6 +4,7 @@ use barchan_datasets::Rgb;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
+use super::doubt::MARK;
 use super::propose::{Choices, MOST, NEVER};
 use crate::classical::{Census, MOST_DIFFERENT};
 
@@ -148,10 +149,37 @@ impl<'a> Likeness<'a> {
         });
     }
 
+    /// How many bits of the census differ between the pixels of a row and what they match; [`MARK`] where the right
+    /// camera does not see it.
+    pub fn differing(&self, y: usize, disparity: &[f32], out: &mut [u8]) {
+        let width = self.colours.width;
+        let left = &self.left.bits[y * width..][..width];
+        differing(
+            left,
+            &self.right[y * (width + 1)..][..width + 1],
+            disparity,
+            out,
+        );
+    }
+
     /// How unlike the two images are under each proposal: differing census bits around the pixel, weighed by
     /// how much the colour there is its own.
     pub fn judge(&self, choices: &mut Choices, y: usize) {
         judge(self, choices, y);
+    }
+}
+
+#[multiversion(targets("x86_64+avx2+popcnt", "aarch64+neon"))]
+fn differing(left: &[u64], right: &[Seen], disparity: &[f32], out: &mut [u8]) {
+    for (x, ((out, left), d)) in out.iter_mut().zip(left).zip(disparity).enumerate() {
+        let at = x.wrapping_sub((d + 0.5) as usize).min(right.len() - 1);
+        let there = right[at];
+        let seen = there.nearest <= d + BEHIND;
+        *out = if seen {
+            (left ^ there.bits).count_ones() as u8
+        } else {
+            MARK
+        };
     }
 }
 

@@ -1,5 +1,6 @@
 //! Outlines of a dense disparity put where the images have them.
 
+mod doubt;
 mod judge;
 mod paths;
 mod propose;
@@ -10,6 +11,7 @@ use rayon::prelude::*;
 use crate::classical::census;
 use crate::engine::{DisparityEngine, DisparityMap, InferError};
 
+use doubt::Doubt;
 use judge::{Colours, Likeness};
 use paths::{Ground, breaks};
 use propose::{Choices, Moved, Surfaces, offsets, propose};
@@ -35,12 +37,14 @@ impl Default for Outlines {
 }
 
 impl Outlines {
-    /// Moves the outlines of `map` to those of the images. Sigma and confidence come along from where a
-    /// disparity is taken. Unknown disparity stays unknown.
+    /// Moves the outlines of `map` to those of the images. Sigma comes along from where a disparity is taken and
+    /// grows with what speaks against it; confidence follows from it. Unknown disparity stays unknown.
     pub fn sharpen(&self, left: &Rgb, right: &Rgb, map: &mut DisparityMap) {
         let (width, height) = (left.width() as usize, left.height() as usize);
-        let fits = map.disparity.dimensions() == left.dimensions();
-        if width < 2 || height < 2 || right.dimensions() != left.dimensions() || !fits {
+        let fits = [&map.disparity, &map.sigma, &map.confidence]
+            .map(|plane| plane.dimensions() == left.dimensions());
+        let matched = right.dimensions() == left.dimensions() && fits == [true; 3];
+        if self.passes == 0 || width < 2 || height < 2 || !matched {
             return;
         }
         let ((colours, left), right) = rayon::join(
@@ -51,20 +55,23 @@ impl Outlines {
         let mut likeness = Likeness::new(&colours, &seen);
         let (breaks, offsets) = (breaks(), offsets());
         let mut surfaces = Surfaces::unknown(width, height);
-        let mut rows = vec![Choices::default(); height];
         let mut moved = Moved::everywhere(width, height);
+        let mut rows = vec![Choices::default(); height];
+        let mut spread = vec![0.0; width * height];
+        let first = (map.disparity.clone(), map.sigma.clone());
         for _ in 0..self.passes {
-            let before = map.clone();
-            let disparity = before.disparity.as_raw();
-            surfaces.set(disparity, width);
-            likeness.set_surfaces(disparity);
+            let (disparity_before, sigma_before) = (map.disparity.clone(), map.sigma.clone());
+            let (disparity_before, sigma_before) =
+                (disparity_before.as_raw(), sigma_before.as_raw());
+            surfaces.set(disparity_before, width);
+            likeness.set_surfaces(disparity_before);
             rows.par_iter_mut().enumerate().for_each(|(y, choices)| {
                 propose(&surfaces, &offsets, &moved, [width, y], choices);
                 likeness.judge(choices, y);
             });
             let ground = Ground {
                 rows: &rows,
-                disparity,
+                disparity: disparity_before,
                 colours: &colours,
                 breaks: &breaks,
             };
@@ -74,27 +81,34 @@ impl Outlines {
             );
             let planes = (map.disparity.par_chunks_mut(width))
                 .zip(map.sigma.par_chunks_mut(width))
-                .zip(map.confidence.par_chunks_mut(width));
+                .zip(spread.par_chunks_mut(width));
             let columns = down.par_iter().zip(&up);
             planes.zip(columns).enumerate().for_each(
-                |(y, (((disparity, sigma), confidence), (down, up)))| {
+                |(y, (((disparity, sigma), spread), (down, up)))| {
                     let row = &rows[y];
-                    let best = ground.choose(y, down, up);
-                    for (k, best) in best.into_iter().enumerate() {
+                    for (k, (best, wide)) in ground.choose(y, down, up).into_iter().enumerate() {
                         let x = row.columns[k] as usize;
                         disparity[x] = row.disparity[k][best];
+                        spread[x] = wide;
                         if let Some(n) = usize::from(row.source[k][best]).checked_sub(1) {
                             let [dx, dy] = offsets[n];
                             let source =
                                 (y.saturating_add_signed(dy) * width + x).saturating_add_signed(dx);
-                            sigma[x] = before.sigma.as_raw()[source];
-                            confidence[x] = before.confidence.as_raw()[source];
+                            sigma[x] = sigma_before[source];
                         }
                     }
                 },
             );
-            moved.set(before.disparity.as_raw(), map.disparity.as_raw(), width);
+            moved.set(disparity_before, map.disparity.as_raw(), width);
         }
+        likeness.set_surfaces(map.disparity.as_raw());
+        let doubt = Doubt {
+            disparity_before: first.0.as_raw(),
+            sigma_before: first.1.as_raw(),
+            disparity: map.disparity.as_raw(),
+            spread: &spread,
+        };
+        doubt.set(&likeness, width, &mut map.sigma, &mut map.confidence);
     }
 }
 

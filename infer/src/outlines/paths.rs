@@ -11,6 +11,8 @@ const BREAK: f32 = 0.5;
 /// The difference of colour by which the most falls to 1/e, and the least share that is left of it.
 const CONTRAST: f32 = 0.05;
 const LEAST_BREAK: f32 = 0.1;
+/// A surface that costs so much more is less probable by e; of four paths together.
+const CLOSE: f32 = 0.2;
 
 /// The most that a step between neighbours costs, by their contrast.
 pub(super) fn breaks() -> Vec<f32> {
@@ -57,31 +59,48 @@ impl Ground<'_> {
         all
     }
 
-    /// Which of its surfaces is the best for each pixel with a choice: all four paths together.
-    pub fn choose(&self, y: usize, down: &[[f32; MOST]], up: &[[f32; MOST]]) -> Vec<usize> {
+    /// Which of its surfaces is the best for each pixel with a choice, all four paths together, and the
+    /// spread of the disparity among them, pixels.
+    pub fn choose(&self, y: usize, down: &[[f32; MOST]], up: &[[f32; MOST]]) -> Vec<(usize, f32)> {
         let n = self.rows[y].columns.len();
         let (mut right, mut left) = (vec![[0.0; MOST]; n], vec![[0.0; MOST]; n]);
         along(*self, y, &mut right, &mut left);
-        let mut best = vec![0; n];
-        cheapest(&self.rows[y].cost, [&right, &left, down, up], &mut best);
+        let mut best = vec![(0, 0.0); n];
+        cheapest(&self.rows[y], [&right, &left, down, up], &mut best);
         best
     }
 }
 
-/// The first of the least; a pixel's own cost counts once.
+/// The first of the least, a pixel's own cost counted once; and the standard deviation from it if what costs more is
+/// as much less probable as an exponential says.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn cheapest(costs: &[[f32; MOST]], paths: [&[[f32; MOST]]; 4], best: &mut [usize]) {
+fn cheapest(row: &Choices, paths: [&[[f32; MOST]]; 4], best: &mut [(usize, f32)]) {
     let [a, b, c, d] = paths;
-    for (k, best) in best.iter_mut().enumerate() {
+    for (k, (best, spread)) in best.iter_mut().enumerate() {
         let mut total = [0.0; MOST];
         for i in 0..MOST {
-            total[i] = a[k][i] + b[k][i] + c[k][i] + d[k][i] - 3.0 * costs[k][i];
+            total[i] = a[k][i] + b[k][i] + c[k][i] + d[k][i] - 3.0 * row.cost[k][i];
         }
         let mut least = total[0];
         for i in 1..MOST {
             *best = if total[i] < least { i } else { *best };
             least = if total[i] < least { total[i] } else { least };
         }
+        let chosen = row.disparity[k][*best];
+        let (mut weights, mut squares) = ([0.0; MOST], [0.0; MOST]);
+        for i in 0..MOST {
+            // The eighth power of 1 + v / 8 instead of exp(v).
+            let root = 1.0 / (1.0 + (total[i] - least) / (8.0 * CLOSE));
+            let (square, apart) = (root * root, row.disparity[k][i] - chosen);
+            weights[i] = square * square * (square * square);
+            squares[i] = weights[i] * apart * apart;
+        }
+        let (mut weight, mut sum) = (0.0, 0.0);
+        for i in 0..usize::from(row.count[k]) {
+            weight += weights[i];
+            sum += squares[i];
+        }
+        *spread = (sum / weight).sqrt();
     }
 }
 
