@@ -147,6 +147,8 @@ impl DisparityEngine for Outlined {
 
 #[cfg(test)]
 mod tests {
+    use std::ops::Range;
+
     use barchan_datasets::Plane;
 
     use super::*;
@@ -239,6 +241,53 @@ mod tests {
         let mut map = map_of(slope.clone());
         Outlines::default().sharpen(&left, &right, &mut map);
         assert!(map.disparity == slope, "a slope moved");
+    }
+
+    #[test]
+    fn sigma_grows_where_the_right_camera_sees_nothing_and_where_images_are_unlike() {
+        let (left, right, truth) = square_before_wall(20, 6);
+        let mut map = map_of(truth);
+        // A part of the wall that is said to be elsewhere, farther than anything reaches.
+        for (x, y) in (120..150).flat_map(|x| (0..96).map(move |y| (x, y))) {
+            map.disparity.put_pixel(x, y, image::Luma([31.0]));
+        }
+        Outlines::default().sharpen(&left, &right, &mut map);
+        let mean = |columns: Range<u32>, of: &Plane| {
+            let rows = columns.flat_map(|x| (35..60).map(move |y| (x, y)));
+            let (n, sum) = rows.fold((0.0, 0.0), |(n, sum), (x, y)| {
+                (n + 1.0, sum + of.get_pixel(x, y)[0])
+            });
+            sum / n
+        };
+        let parts = [70..100, 48..58, 134..140];
+        let [seen, hidden, unlike] = parts.clone().map(|columns| mean(columns, &map.sigma));
+        assert!(
+            hidden > 1.5 * seen && unlike > 1.5 * seen,
+            "{seen} {hidden} {unlike}"
+        );
+        let [seen, hidden, unlike] = parts.map(|columns| mean(columns, &map.confidence));
+        assert!(hidden < seen && unlike < seen, "{seen} {hidden} {unlike}");
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_no_bit() {
+        let (left, right, truth) = square_before_wall(20, 6);
+        let fat = Plane::from_fn(WIDTH, HEIGHT, |x, y| {
+            let near = (53..117).contains(&x) && (18..77).contains(&y);
+            image::Luma([if near { 20.0 } else { 6.0 + 0.002 * x as f32 }])
+        });
+        let maps = [1, 2, 5].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            let mut map = map_of(fat.clone());
+            pool.unwrap()
+                .install(|| Outlines::default().sharpen(&left, &right, &mut map));
+            map
+        });
+        assert!(wrong(&maps[0], &truth) < wrong(&map_of(fat), &truth) / 4);
+        for map in &maps[1..] {
+            assert!(map.disparity == maps[0].disparity && map.sigma == maps[0].sigma);
+            assert!(map.confidence == maps[0].confidence);
+        }
     }
 
     #[test]

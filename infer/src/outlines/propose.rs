@@ -252,7 +252,8 @@ impl Choices {
         x: usize,
         width: usize,
     ) {
-        let mut disparity = [[f32::NAN; LANES]; MOST];
+        // Far from everything, but from the unknown: what is unknown stays so.
+        let mut disparity = [[f32::INFINITY; LANES]; MOST];
         let mut source = [[0u8; LANES]; MOST];
         let mut count = [1u32; LANES];
         let mut most = 1;
@@ -264,7 +265,7 @@ impl Choices {
             }
             for there in &disparity[..most] {
                 for i in 0..LANES {
-                    new[i] &= u32::from(!((there[i] - proposed[i]).abs() <= SAME));
+                    new[i] &= u32::from((there[i] - proposed[i]).abs() > SAME);
                 }
             }
             let mut any = 0;
@@ -291,8 +292,7 @@ impl Choices {
             most = largest as usize;
         }
         for i in 0..LANES.min(width - x) {
-            // What is unknown stays so.
-            if count[i] > 1 && !here[i].is_nan() {
+            if count[i] > 1 {
                 self.slot[x + i] = self.columns.len() as u32;
                 self.columns.push((x + i) as u32);
                 self.count.push(count[i] as u8);
@@ -305,5 +305,65 @@ impl Choices {
                 self.source.push(from);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn proposals_are_surfaces_around_that_differ_and_the_first_is_what_is_there() {
+        let (width, height) = (90, 40);
+        // Terraces on a slope, and a hole.
+        let mut d: Vec<f32> = (0..width * height)
+            .map(|i| 4.0 * ((i % width) / 13 % 3) as f32 + 0.1 * (i / width) as f32)
+            .collect();
+        d[20 * width + 30] = f32::NAN;
+        let mut surfaces = Surfaces::unknown(width, height);
+        surfaces.set(&d, width);
+        let (offsets, all) = (offsets(), Moved::everywhere(width, height));
+        let mut choices = Choices::default();
+        let mut found = 0;
+        for y in 0..height {
+            propose(&surfaces, &offsets, &all, [width, y], &mut choices);
+            for (k, &x) in choices.columns.iter().enumerate() {
+                let (x, own) = (x as usize, &choices.disparity[k]);
+                let own = &own[..usize::from(choices.count[k])];
+                assert_eq!(own[0], d[y * width + x]);
+                assert_eq!(choices.slot[x], k as u32);
+                assert!(own.len() >= 2);
+                for (i, a) in own.iter().enumerate() {
+                    assert!(*a >= 0.0 && own[..i].iter().all(|b| (a - b).abs() > SAME));
+                    let Some(n) = usize::from(choices.source[k][i]).checked_sub(1) else {
+                        continue;
+                    };
+                    // Terraces rise by 0.1 a row and not along it, outside their edges.
+                    let [dx, dy] = offsets[n];
+                    let source = y.saturating_add_signed(dy) * width + x.saturating_add_signed(dx);
+                    assert!(
+                        (a - (d[source] - 0.1 * dy as f32)).abs() < 1.1,
+                        "{a} at {x} {y}"
+                    );
+                }
+                found += 1;
+            }
+        }
+        assert!(found > 1000, "{found}");
+        assert_eq!(choices.slot.len(), width);
+    }
+
+    #[test]
+    fn only_what_is_near_a_movement_chooses_again() {
+        let (width, height) = (400, 60);
+        let before = vec![5.0; width * height];
+        let mut after = before.clone();
+        after[30 * width + 200] = 9.0;
+        let mut moved = Moved::everywhere(width, height);
+        assert!(moved.near(0, 0));
+        moved.set(&before, &after, width);
+        assert!(moved.near(192, 30) && moved.near(192, 20) && moved.near(192, 40));
+        assert!(!moved.near(192, 19) && !moved.near(192, 41) && !moved.near(0, 30));
+        assert!(!moved.near(320, 30));
     }
 }
