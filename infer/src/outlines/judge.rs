@@ -136,8 +136,8 @@ impl<'a> Likeness<'a> {
                 seen.nearest = 0.0;
             }
             for (x, d) in row.iter().enumerate() {
-                let at = x as isize - (d + 0.5) as isize;
-                if let Some(there) = usize::try_from(at).ok().and_then(|at| seen.get_mut(at)) {
+                // Left of the image wraps to far beyond its end.
+                if let Some(there) = seen.get_mut(x.wrapping_sub((d + 0.5) as usize)) {
                     // An unknown disparity is never the larger.
                     there.nearest = if *d > there.nearest {
                         *d

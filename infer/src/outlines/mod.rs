@@ -24,6 +24,10 @@ use propose::{Choices, Moved, Surfaces, offsets, propose};
 /// paths, agree: semi-global matching (Hirschmüller 2008) among few planes, proposed as in PatchMatch stereo
 /// (Bleyer 2011). What nearer surfaces hide from the right camera is no match at all, and costs as much
 /// whatever it is taken for.
+///
+/// Sigma then says how far off that may be: a power of the product of the sigma that came along, the pixel's own, how
+/// far the disparity moved, and the spread of what the pixel might have been; times exponentials of how unlike the
+/// images are around the pixel and of whether it is hidden.
 #[derive(Clone, Copy, Debug)]
 pub struct Outlines {
     /// How often: each pass moves outlines by up to ten pixels.
