@@ -4,7 +4,7 @@
 use barchan_datasets::{StereoFrame, open};
 use barchan_geometry::nalgebra::{Point3, Vector3, Vector6};
 use barchan_geometry::{Se3, se3};
-use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Rejection, Runtime};
+use barchan_infer::{BurnEngine, DisparityEngine, OnnxEngine, Outlines, Rejection, Runtime};
 use barchan_model::{Device, Preset, StereoNet, onnx};
 use barchan_slam::{BundleAdjustment, Observation, PoseEdge, PoseGraph, Slam, SlamConfig};
 use barchan_terrain::elevation::{ElevationConfig, ElevationMap, Scan};
@@ -64,6 +64,20 @@ fn rejection(bencher: Bencher) {
         .with_inputs(|| map.clone())
         .bench_local_values(|mut map| {
             Rejection::default().apply(&frames[0].left, &frames[0].right, &mut map)
+        });
+}
+
+#[divan::bench(sample_count = 10)]
+fn outlines(bencher: Bencher) {
+    let (frames, _) = frames(1);
+    let map = onnxruntime()
+        .disparity(&frames[0].left, &frames[0].right)
+        .expect("our own file");
+    bencher
+        .with_inputs(|| map.clone())
+        .bench_local_values(|mut map| {
+            Outlines::default().sharpen(&frames[0].left, &frames[0].right, &mut map);
+            map
         });
 }
 
