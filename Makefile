@@ -87,7 +87,7 @@ dist: ## the program without symbols and the licences of its crates, for package
 	$(PYTHON) scripts/licences.py > $(CARGO_TARGET_DIR)/dist/LICENCES.txt
 
 bench: onnxruntime ## timings of the main job, step by step
-	cargo bench --workspace --bench main_job $(CARGO_FLAGS)
+	cargo bench --workspace --bench main_job --bench terrain $(CARGO_FLAGS)
 
 peers: build onnxruntime $(PEERS)/ready ## outputs against other people's programs: ONNX Runtime, evo, GDAL, OpenCV, Open3D (0.6 GB to fetch)
 	$(PEERS)/bin/python tests/peers/run.py --barchan "$(BARCHAN)"
