@@ -417,7 +417,8 @@ impl Slam {
                 twist.fixed_rows::<3>(0).norm(),
                 twist.fixed_rows::<3>(3).norm(),
             );
-            (before.submap == place.submap).then(|| (LEAST.0 + SHARE * way, LEAST.1 + SHARE * turn))
+            (before.submap == place.submap)
+                .then_some((LEAST.0 + SHARE * way, LEAST.1 + SHARE * turn))
         });
         sigma.map(|sigma| Way {
             place: place.keyframe,

@@ -173,7 +173,7 @@ mod tests {
         let lines: Vec<Vec<u8>> = (0..9)
             .map(|j| {
                 let bits = |x: usize| {
-                    if (x + j) % 7 == 0 {
+                    if (x + j).is_multiple_of(7) {
                         MARK
                     } else {
                         (x * j % 60) as u8
