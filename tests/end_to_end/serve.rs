@@ -159,9 +159,17 @@ fn it_answers_as_infer_slam_and_map_do() {
     let [infer, slam, runs] = ["infer", "slam", "runs"].map(|n| dir.path().join(n));
     let args = ["--model", "sgm:64", "--data", text(&data), "--no-check"];
     json(&[&["infer"], &args[..], &["--out", text(&infer)]].concat());
-    // The service is sent images alone.
-    let blind = ["--no-fusion", "--out", text(&slam)];
-    json(&[&["slam"], &args[..], &blind].concat());
+    // The service is sent images alone, and waits for the map before it answers.
+    let waiting = dir.path().join("waiting.toml");
+    std::fs::write(&waiting, "map_lag = 0\n").unwrap();
+    let alike = [
+        "--no-fusion",
+        "--config",
+        text(&waiting),
+        "--out",
+        text(&slam),
+    ];
+    json(&[&["slam"], &args[..], &alike].concat());
     let times = std::fs::read_to_string(data.join("times.txt")).unwrap();
     let times: Vec<&str> = times.lines().collect();
     let service = Service::start(&data, &["--runs", text(&runs)]);
