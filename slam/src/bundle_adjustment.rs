@@ -57,6 +57,7 @@ impl BundleAdjustment {
             for (pose, slot) in self.T_cam_world.iter_mut().zip(&free) {
                 if let Some(slot) = slot {
                     *pose = se3::exp(&pose_steps[*slot]) * *pose;
+                    pose.rotation.renormalize();
                 }
             }
             for (point, step) in self.points.iter_mut().zip(&point_steps) {

@@ -120,6 +120,9 @@ pub fn optimise_pose(
     T_guess: &Se3,
 ) -> PoseEstimate {
     let mut T_cam_world = *T_guess;
+    // A guess is often made of poses found before: what rounding made of the length of their quaternions would
+    // grow with every round, threefold where it is `T * T_before.inverse() * T`, and be no rotation soon.
+    T_cam_world.rotation.renormalize();
     let mut inliers = vec![true; observations.len()];
     for round in 0..4 {
         // The last rounds trust what is left: plain least squares.
@@ -361,6 +364,22 @@ pub(crate) mod tests {
         let found = optimise_pose(&rig(), &observations, &Se3::identity());
         assert!(error(&found.T_cam_world, &truth()) < 1e-6);
         assert!(found.inliers[..50].iter().all(|i| !i) && found.inliers[50..].iter().all(|i| *i));
+    }
+
+    /// Each guess is made of poses found before, as constant velocity does: after a hundred, still a rotation.
+    #[test]
+    fn poses_made_of_poses_stay_rigid() {
+        let step = se3::exp(&Vector6::new(0.01, 0.0, 0.02, 0.01, -0.02, 0.03));
+        let (mut before, mut last, mut truth) = (Se3::identity(), Se3::identity(), Se3::identity());
+        for frame in 0..100 {
+            truth = step * truth;
+            let guess = last * before.inverse() * last;
+            let found = optimise_pose(&rig(), &world(&truth, 30, frame), &guess);
+            let length = found.T_cam_world.rotation.as_vector().norm();
+            assert!((length - 1.0).abs() < 1e-12, "{frame}: {length}");
+            assert!(error(&found.T_cam_world, &truth) < 1e-6);
+            (before, last) = (last, found.T_cam_world);
+        }
     }
 
     #[test]

@@ -240,20 +240,7 @@ fn a_real_rover_in_a_sand_arena() {
         return;
     }
     let source = open(&format!("folder:{}", data.display())).unwrap();
-    let (reports, result) = run(
-        source.as_ref(),
-        SfmConfig::default(),
-        frames(source.as_ref()),
-    );
-    // Where it turns and little is to be seen, the way of one camera breaks; but never unsaid.
-    for pair in reports
-        .windows(2)
-        .filter(|pair| pair[0].piece != pair[1].piece)
-    {
-        assert!(pair[1].reason.contains("anew"), "{:?}", pair[1]);
-    }
-    let placed = result.tracked.iter().filter(|t| **t).count();
-    assert!(placed >= 115, "{placed}");
-    let score = score_of(&result, source.as_ref());
-    assert!(score.ate_rmse_sim3 <= 0.2, "{score:?}");
+    // The example `sfm_seeds` tells how much of this is chance: of 0.046 m, a millimetre.
+    let (_, score) = whole(source.as_ref(), SfmConfig::default());
+    assert!(score.ate_rmse_sim3 <= 0.1, "{score:?}");
 }
