@@ -39,6 +39,19 @@ pub enum EvalError {
         /// Which pose, from 0.
         index: usize,
     },
+    /// Too few poses have truth before and after them to tell whether clocks differ.
+    #[error(
+        "only {poses} poses have truth for {most:.1} s before and after them, and {fewest} are needed\n  \
+         cure: a smaller largest shift"
+    )]
+    TooShortToShift {
+        /// Poses that have.
+        poses: usize,
+        /// How many are needed.
+        fewest: usize,
+        /// The largest shift, seconds.
+        most: f64,
+    },
     /// The truth is shorter than the shortest segment.
     #[error(
         "the truth is {length:.1} m long and the KITTI segments start at {shortest} m: use the relative pose error per frame"

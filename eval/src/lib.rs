@@ -1,6 +1,7 @@
 //! Scores: how far an estimate lies from the truth, by the definitions the field uses.
 //!
 //! What it is for: [`trajectory`] (absolute and relative pose error, KITTI segment errors),
+//! [`mod@time_shift`] (clocks that differ),
 //! [`disparity`] (end-point error, bad pixels, density), [`mod@matches`] (how many each rule accepts,
 //! how many are true), [`elevation`] (differences of heights, whether stated bounds hold) and
 //! [`cloud`] (distances of points).
@@ -16,6 +17,7 @@ pub mod disparity;
 pub mod elevation;
 mod error;
 pub mod matches;
+pub mod time_shift;
 pub mod trajectory;
 
 pub use disparity::{DisparityFigures, DisparityScore, DisparityTally};

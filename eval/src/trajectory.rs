@@ -325,7 +325,10 @@ fn relative_error(pairs: &PosePairs, i: usize, j: usize) -> Se3 {
     step_true.inv_mul(&step_est)
 }
 
-fn in_order_of_time(t: &Trajectory, which: &'static str) -> Result<Vec<StampedPose>, EvalError> {
+pub(crate) fn in_order_of_time(
+    t: &Trajectory,
+    which: &'static str,
+) -> Result<Vec<StampedPose>, EvalError> {
     let finite = |p: &StampedPose| {
         p.time.is_finite() && p.T_world_cam.to_homogeneous().iter().all(|v| v.is_finite())
     };

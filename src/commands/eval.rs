@@ -6,7 +6,8 @@ use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, open, read_planar};
 use barchan_eval::cloud::{CloudScore, score as score_cloud};
 use barchan_eval::disparity::DisparityTally;
-use barchan_eval::trajectory::{DEFAULT_TOLERANCE, score};
+use barchan_eval::time_shift::{TimeShift, time_shift};
+use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
 use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::nalgebra::Point3;
 use barchan_geometry::registration::{IcpConfig, IcpMethod, Reference, Registration, register};
@@ -21,6 +22,7 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan eval trajectory --est runs/s/trajectory.tum --gt images/gt.csv\n  \
+    barchan eval trajectory --est runs/k/trajectory.tum --gt katwijk:part1   fixes; are the images ahead of them?\n  \
     barchan eval cloud --est map/cloud.ply --ref survey.laz\n  \
     barchan eval dem --est map/elevation.tif --ref survey.tif --error-map error.tif\n  \
     barchan eval disparity --pred out/disparity --gt synth:seed=1,frames=40 --json\n  \
@@ -46,9 +48,12 @@ enum What {
         /// The estimate
         #[arg(long, value_name = "FILE")]
         est: PathBuf,
-        /// The truth
-        #[arg(long, value_name = "FILE")]
-        gt: PathBuf,
+        /// The truth: a file, or data that has true poses or fixes
+        #[arg(long, value_name = "FILE|DATA")]
+        gt: String,
+        /// Largest difference of the two clocks that is looked for, seconds; 0 looks for none
+        #[arg(long, default_value_t = 5.0, value_name = "SECONDS")]
+        max_shift: f64,
         /// Largest difference in time of poses that are compared, seconds
         #[arg(long, default_value_t = DEFAULT_TOLERANCE)]
         tolerance: f64,
@@ -109,7 +114,12 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             reference,
             error_map,
         } => dem(&est, &reference, error_map.as_deref(), output),
-        What::Trajectory { est, gt, tolerance } => trajectory(&est, &gt, tolerance, output),
+        What::Trajectory {
+            est,
+            gt,
+            tolerance,
+            max_shift,
+        } => trajectory(&est, &gt, tolerance, max_shift, output),
         What::Matches(args) => matches::run(args, output, runtime),
     }
 }
@@ -285,17 +295,45 @@ fn dem(est: &Path, reference: &Path, error_map: Option<&Path>, output: &Output) 
     output.result(&s, &text)
 }
 
-fn trajectory(est: &Path, gt: &Path, tolerance: f64, output: &Output) -> Result<()> {
-    let s = score(&read_trajectory(est)?, &read_trajectory(gt)?, tolerance)?;
+/// What `--json` prints of a trajectory.
+#[derive(Serialize)]
+struct TrajectoryFigures {
+    #[serde(flatten)]
+    score: TrajectoryScore,
+    /// None where too little truth lies around the poses.
+    time_shift: Option<TimeShift>,
+}
+
+fn trajectory(est: &Path, gt: &str, tolerance: f64, max_shift: f64, output: &Output) -> Result<()> {
+    let est = read_trajectory(est)?;
+    let truth = match Path::new(gt).is_file() {
+        true => read_trajectory(Path::new(gt))?,
+        false => (open(gt)?.true_trajectory().cloned())
+            .with_context(|| format!("{gt}: no true poses and no fixes"))?,
+    };
+    let s = score(&est, &truth, tolerance)?;
+    let shift = (max_shift > 0.0)
+        .then(|| time_shift(&est, &truth, max_shift).ok())
+        .flatten();
     let rotation = s
         .rpe_rot_deg_per_m
         .map_or("truth has no rotation".into(), |r| format!("{r:.3} deg/m"));
+    let clocks = shift.map_or("not enough truth around the poses".into(), |s| {
+        format!(
+            "the estimate is {:.2} s ahead, give or take {:.2} s (Sim3 ATE {:.4} m, {:.4} m with that mended)",
+            s.ahead, s.give_or_take, s.error_before, s.error_after
+        )
+    });
     let text = format!(
         "frames           {}\nlength           {:.3} m\nATE, SE3         {:.4} m\nATE, Sim3        {:.4} m (scale {:.4})\n\
-         RPE translation  {:.3} %\nRPE rotation     {rotation}",
+         RPE translation  {:.3} %\nRPE rotation     {rotation}\nclocks           {clocks}",
         s.frames, s.length, s.ate_rmse, s.ate_rmse_sim3, s.scale, s.rpe_trans_percent
     );
-    output.result(&s, &text)
+    let figures = TrajectoryFigures {
+        score: s,
+        time_shift: shift,
+    };
+    output.result(&figures, &text)
 }
 
 /// By content: comma-separated with a header, twelve numbers a line (KITTI), or eight (TUM).

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::StereoSource;
+use barchan_eval::time_shift::{TimeShift, time_shift};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align, associate, path_length, score};
 use barchan_geometry::nalgebra::Vector3;
 use barchan_geometry::{Se3, Trajectory};
@@ -57,6 +58,9 @@ pub struct Args {
     unchecked: Unchecked,
 }
 
+/// Largest difference of the clocks of images and truth that is looked for, seconds.
+const MOST_SHIFT: f64 = 5.0;
+
 /// One line of the table.
 #[derive(Debug, Default, Serialize)]
 struct Row {
@@ -82,6 +86,8 @@ struct Row {
     coverage_percent: Option<f64>,
     /// Milliseconds a frame, all together.
     ms: Option<f64>,
+    /// By how much the images are ahead of the truth, as this run has it.
+    clocks: Option<TimeShift>,
 }
 
 /// What `--json` prints and `compare.json` holds.
@@ -301,6 +307,7 @@ impl Compared {
             row.ate = Some(found.ate_rmse);
             row.ate_percent = Some(100.0 * found.ate_rmse / found.length);
             let off = end_error(&route, truth, &motion)?;
+            row.clocks = time_shift(&route, truth, MOST_SHIFT).ok();
             row.drift_percent = Some(100.0 * off / found.length);
         }
         self.map = ground.map(folder, &motion)?;
@@ -356,6 +363,13 @@ fn table(comparison: &Comparison) -> String {
     }
     if let Some(length) = comparison.length {
         text += &format!("the way is {length:.2} m long; ");
+    }
+    let clocks = comparison.rows.iter().filter_map(|r| r.clocks);
+    if let Some(c) = clocks.min_by(|a, b| a.error_after.total_cmp(&b.error_after)) {
+        text += &format!(
+            "images are {:.2} s ahead of the truth, give or take {:.2} s; ",
+            c.ahead, c.give_or_take
+        );
     }
     text += &format!("maps are held against {}\n", comparison.ground);
     text
