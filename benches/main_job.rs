@@ -76,7 +76,7 @@ fn outlines(bencher: Bencher) {
     bencher
         .with_inputs(|| map.clone())
         .bench_local_values(|mut map| {
-            Outlines::default().sharpen(&frames[0].left, &frames[0].right, &mut map);
+            Outlines::default().sharpen(&frames[0].left, &frames[0].right, None, &mut map);
             map
         });
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use barchan_infer::{
     BlockMatching, BurnEngine, Contract, DisparityEngine, OnnxEngine, Outlined, Outlines, Runtime,
-    SemiGlobal,
+    SecondOpinion, SemiGlobal,
 };
 use barchan_model::{Device, StereoNet, onnx, weights};
 use barchan_train::RunDir;
@@ -29,6 +29,28 @@ pub struct EngineSettings {
     /// by up to ten pixels. 0 leaves the network's answer as it is
     #[arg(long, default_value_t = Outlines::default().passes, value_name = "PASSES")]
     pub outlines: usize,
+    /// Where else outlines get surfaces from that the network missed: semi-global matching, of the whole images or of
+    /// half their size [default: full; half where pairs come as a stream]
+    #[arg(long, value_enum, value_name = "SIZE")]
+    pub second_opinion: Option<OpinionSize>,
+}
+
+/// `--second-opinion`.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+pub enum OpinionSize {
+    Full,
+    Half,
+    None,
+}
+
+impl EngineSettings {
+    /// These, for pairs that come as a stream: what was not asked for is what is fast.
+    pub fn streaming(self) -> Self {
+        Self {
+            second_opinion: self.second_opinion.or(Some(OpinionSize::Half)),
+            ..self
+        }
+    }
 }
 
 /// The network of a shipped name, a safetensors file, or a run directory of `barchan train`; with
@@ -75,9 +97,14 @@ pub fn load_engine(
     }
     let threads = settings.threads;
     let outlined = |engine: Box<dyn DisparityEngine>| -> Box<dyn DisparityEngine> {
+        let opinion = match settings.second_opinion {
+            None | Some(OpinionSize::Full) => SecondOpinion::Full,
+            Some(OpinionSize::Half) => SecondOpinion::Half,
+            Some(OpinionSize::None) => SecondOpinion::None,
+        };
         match settings.outlines {
             0 => engine,
-            passes => Box::new(Outlined::new(engine, Outlines { passes })),
+            passes => Box::new(Outlined::new(engine, Outlines { passes }, opinion)),
         }
     };
     let path = Path::new(model);

@@ -34,7 +34,7 @@ pub use onnxruntime::{
     Channels, Contract, ImageFormat, InputFormat, Layout, ModelSize, OnnxEngine, OutputFormat,
     OutputLayout, Runtime, Side, Unit,
 };
-pub use outlines::{Outlined, Outlines};
+pub use outlines::{Outlined, Outlines, SecondOpinion};
 #[cfg(feature = "onnxruntime")]
 pub use probe::{Decision, Verdict, probe};
 #[cfg(feature = "onnxruntime")]

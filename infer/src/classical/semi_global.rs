@@ -26,6 +26,11 @@ impl SemiGlobal {
             ..Self::default()
         }
     }
+
+    /// Searches disparities `0..range` from now on.
+    pub(crate) fn search(&mut self, range: usize) {
+        self.range = Some(range);
+    }
 }
 
 impl DisparityEngine for SemiGlobal {

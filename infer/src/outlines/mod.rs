@@ -2,6 +2,7 @@
 
 mod doubt;
 mod judge;
+mod opinion;
 mod paths;
 mod propose;
 
@@ -13,8 +14,10 @@ use crate::engine::{DisparityEngine, DisparityMap, InferError};
 
 use doubt::Doubt;
 use judge::{Colours, Likeness};
+use opinion::Opinion;
+pub use opinion::SecondOpinion;
 use paths::{Ground, breaks};
-use propose::{Choices, Moved, Surfaces, offsets, propose};
+use propose::{AROUND, Choices, Moved, OPINION, Surfaces, offsets, propose};
 
 /// Puts outlines where the images have them: a matching window that reaches over an outline fattens the
 /// nearer surface, and what works at a quarter of the resolution draws outlines as coarsely.
@@ -22,7 +25,8 @@ use propose::{Choices, Moved, Surfaces, offsets, propose};
 /// Every pixel may take over the surface of a pixel up to ten away, disparity and slope, if full-resolution
 /// likeness (census, weighed by colour around the pixel) and the neighbours' choices, along four
 /// paths, agree: semi-global matching (Hirschmüller 2008) among few planes, proposed as in PatchMatch stereo
-/// (Bleyer 2011). What nearer surfaces hide from the right camera is no match at all, and costs as much
+/// (Bleyer 2011). One more surface is what a second opinion takes the pixel for, a matcher that searches all
+/// disparities at each pixel: so thin things that the network never saw can come back. What nearer surfaces hide from the right camera is no match at all, and costs as much
 /// whatever it is taken for.
 ///
 /// Sigma then says how far off that may be: a power of the product of the sigma that came along, the pixel's own, how
@@ -42,11 +46,22 @@ impl Default for Outlines {
 
 impl Outlines {
     /// Moves the outlines of `map` to those of the images. Sigma comes along from where a disparity is taken and
-    /// grows with what speaks against it; confidence follows from it. Unknown disparity stays unknown.
-    pub fn sharpen(&self, left: &Rgb, right: &Rgb, map: &mut DisparityMap) {
+    /// grows with what speaks against it; confidence follows from it. Unknown disparity stays unknown. `opinion` is
+    /// another matcher's answer, with holes where it knows nothing.
+    pub fn sharpen(
+        &self,
+        left: &Rgb,
+        right: &Rgb,
+        opinion: Option<&DisparityMap>,
+        map: &mut DisparityMap,
+    ) {
         let (width, height) = (left.width() as usize, left.height() as usize);
         let fits = [&map.disparity, &map.sigma, &map.confidence]
             .map(|plane| plane.dimensions() == left.dimensions());
+        let opinion = opinion.filter(|o| {
+            [&o.disparity, &o.sigma].map(|plane| plane.dimensions() == left.dimensions())
+                == [true; 2]
+        });
         let matched = right.dimensions() == left.dimensions() && fits == [true; 3];
         if self.passes == 0 || width < 2 || height < 2 || !matched {
             return;
@@ -70,7 +85,8 @@ impl Outlines {
             surfaces.set(disparity_before, width);
             likeness.set_surfaces(disparity_before);
             rows.par_iter_mut().enumerate().for_each(|(y, choices)| {
-                propose(&surfaces, &offsets, &moved, [width, y], choices);
+                let opinion = opinion.map(|o| &o.disparity.as_raw()[y * width..][..width]);
+                propose(&surfaces, &offsets, opinion, &moved, [width, y], choices);
                 likeness.judge(choices, y);
             });
             let ground = Ground {
@@ -94,11 +110,14 @@ impl Outlines {
                         let x = row.columns[k] as usize;
                         disparity[x] = row.disparity[k][best];
                         spread[x] = wide;
-                        if let Some(n) = usize::from(row.source[k][best]).checked_sub(1) {
+                        let source = usize::from(row.source[k][best]);
+                        if let Some(n) = source.checked_sub(AROUND) {
                             let [dx, dy] = offsets[n];
                             let source =
                                 (y.saturating_add_signed(dy) * width + x).saturating_add_signed(dx);
                             sigma[x] = sigma_before[source];
+                        } else if let Some(opinion) = opinion.filter(|_| source == OPINION) {
+                            sigma[x] = opinion.sigma.as_raw()[y * width + x];
                         }
                     }
                 },
@@ -120,12 +139,32 @@ impl Outlines {
 pub struct Outlined {
     engine: Box<dyn DisparityEngine>,
     outlines: Outlines,
+    opinion: Opinion,
 }
 
 impl Outlined {
-    /// `engine`, and then [`Outlines::sharpen`].
-    pub fn new(engine: Box<dyn DisparityEngine>, outlines: Outlines) -> Self {
-        Self { engine, outlines }
+    /// `engine`, and then [`Outlines::sharpen`] with a second opinion.
+    pub fn new(
+        engine: Box<dyn DisparityEngine>,
+        outlines: Outlines,
+        opinion: SecondOpinion,
+    ) -> Self {
+        Self {
+            engine,
+            outlines,
+            opinion: Opinion::new(opinion),
+        }
+    }
+
+    fn sharpen(
+        &mut self,
+        left: &Rgb,
+        right: &Rgb,
+        map: &mut DisparityMap,
+    ) -> Result<(), InferError> {
+        let opinion = self.opinion.of(left, right, map)?;
+        self.outlines.sharpen(left, right, opinion.as_ref(), map);
+        Ok(())
     }
 }
 
@@ -136,14 +175,14 @@ impl DisparityEngine for Outlined {
 
     fn disparity(&mut self, left: &Rgb, right: &Rgb) -> Result<DisparityMap, InferError> {
         let mut map = self.engine.disparity(left, right)?;
-        self.outlines.sharpen(left, right, &mut map);
+        self.sharpen(left, right, &mut map)?;
         Ok(map)
     }
 
     fn disparity_batch(&mut self, pairs: &[(&Rgb, &Rgb)]) -> Result<Vec<DisparityMap>, InferError> {
         let mut maps = self.engine.disparity_batch(pairs)?;
         for ((left, right), map) in pairs.iter().zip(&mut maps) {
-            self.outlines.sharpen(left, right, map);
+            self.sharpen(left, right, map)?;
         }
         Ok(maps)
     }
@@ -221,7 +260,7 @@ mod tests {
         });
         let mut map = map_of(fat);
         let before = wrong(&map, &truth);
-        Outlines::default().sharpen(&left, &right, &mut map);
+        Outlines::default().sharpen(&left, &right, None, &mut map);
         let after = wrong(&map, &truth);
         assert!(
             before > 1400 && after < before / 20,
@@ -230,11 +269,78 @@ mod tests {
     }
 
     #[test]
+    fn what_was_missed_comes_back_by_a_second_opinion_and_only_if_the_images_agree() {
+        let (left, right, truth) = square_before_wall(20, 6);
+        // The network saw the wall alone; nothing nearer is around to be proposed.
+        let wall = || map_of(Plane::from_pixel(WIDTH, HEIGHT, image::Luma([6.0])));
+        let missed = wrong(&wall(), &truth);
+        let mut alone = wall();
+        Outlines::default().sharpen(&left, &right, None, &mut alone);
+        assert_eq!(wrong(&alone, &truth), missed);
+        let mut told = wall();
+        let opinion = map_of(truth.clone());
+        Outlines::default().sharpen(&left, &right, Some(&opinion), &mut told);
+        assert!(
+            wrong(&told, &truth) < missed / 20,
+            "{} wrong",
+            wrong(&told, &truth)
+        );
+        // An opinion that the images contradict is not followed, and one of another size is none.
+        let mut lied_to = map_of(truth.clone());
+        let lie = map_of(Plane::from_pixel(WIDTH, HEIGHT, image::Luma([33.0])));
+        Outlines::default().sharpen(&left, &right, Some(&lie), &mut lied_to);
+        assert!(
+            wrong(&lied_to, &truth) < 20,
+            "{} moved",
+            wrong(&lied_to, &truth)
+        );
+        let mut other = wall();
+        let small = map_of(Plane::from_pixel(9, 9, image::Luma([20.0])));
+        Outlines::default().sharpen(&left, &right, Some(&small), &mut other);
+        assert_eq!(wrong(&other, &truth), missed);
+    }
+
+    #[test]
+    fn an_engine_asks_for_a_second_opinion_by_itself() {
+        /// Sees the wall, and of the square but one corner.
+        struct Blind;
+        impl DisparityEngine for Blind {
+            fn name(&self) -> String {
+                "blind".into()
+            }
+            fn disparity(&mut self, _: &Rgb, _: &Rgb) -> Result<DisparityMap, InferError> {
+                let corner = |x, y| {
+                    if x < 64 && (25..30).contains(&y) && x >= 60 {
+                        20.0
+                    } else {
+                        6.0
+                    }
+                };
+                Ok(map_of(Plane::from_fn(WIDTH, HEIGHT, |x, y| {
+                    image::Luma([corner(x, y)])
+                })))
+            }
+        }
+        let (left, right, truth) = square_before_wall(20, 6);
+        let wrong_with = |opinion| {
+            let mut engine = Outlined::new(Box::new(Blind), Outlines::default(), opinion);
+            wrong(&engine.disparity(&left, &right).unwrap(), &truth)
+        };
+        let [none, half, full] = [
+            SecondOpinion::None,
+            SecondOpinion::Half,
+            SecondOpinion::Full,
+        ]
+        .map(wrong_with);
+        assert!(none > 900 && full < none / 8, "{none} {half} {full}");
+    }
+
+    #[test]
     fn truth_and_slopes_stay_and_what_is_unknown_stays_unknown() {
         let (left, right, truth) = square_before_wall(20, 6);
         let mut map = map_of(truth.clone());
         map.disparity.put_pixel(10, 10, image::Luma([f32::NAN]));
-        Outlines::default().sharpen(&left, &right, &mut map);
+        Outlines::default().sharpen(&left, &right, None, &mut map);
         assert!(map.disparity.get_pixel(10, 10)[0].is_nan());
         map.disparity.put_pixel(10, 10, *truth.get_pixel(10, 10));
         assert!(wrong(&map, &truth) < 20, "{} moved", wrong(&map, &truth));
@@ -243,7 +349,7 @@ mod tests {
             image::Luma([5.0 + 0.1 * x as f32 + 0.2 * y as f32])
         });
         let mut map = map_of(slope.clone());
-        Outlines::default().sharpen(&left, &right, &mut map);
+        Outlines::default().sharpen(&left, &right, None, &mut map);
         assert!(map.disparity == slope, "a slope moved");
     }
 
@@ -255,7 +361,7 @@ mod tests {
         for (x, y) in (120..150).flat_map(|x| (0..96).map(move |y| (x, y))) {
             map.disparity.put_pixel(x, y, image::Luma([31.0]));
         }
-        Outlines::default().sharpen(&left, &right, &mut map);
+        Outlines::default().sharpen(&left, &right, None, &mut map);
         let mean = |columns: Range<u32>, of: &Plane| {
             let rows = columns.flat_map(|x| (35..60).map(move |y| (x, y)));
             let (n, sum) = rows.fold((0.0, 0.0), |(n, sum), (x, y)| {
@@ -284,7 +390,7 @@ mod tests {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             let mut map = map_of(fat.clone());
             pool.unwrap()
-                .install(|| Outlines::default().sharpen(&left, &right, &mut map));
+                .install(|| Outlines::default().sharpen(&left, &right, None, &mut map));
             map
         });
         assert!(wrong(&maps[0], &truth) < wrong(&map_of(fat), &truth) / 4);
@@ -308,7 +414,7 @@ mod tests {
                     sigma: plane.clone(),
                     confidence: plane,
                 };
-                Outlines::default().sharpen(&image, &image, &mut map);
+                Outlines::default().sharpen(&image, &image, Some(&map.clone()), &mut map);
             }
         }
     }

@@ -1,4 +1,4 @@
-//! What a pixel may be: the surfaces around it.
+//! What a pixel may be: the surfaces around it, and what a second opinion takes it for.
 
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -84,12 +84,15 @@ pub(super) struct Choices {
     /// How many surfaces there are.
     pub count: Vec<u8>,
     pub disparity: Vec<[f32; MOST]>,
-    /// Which of [`offsets`] a surface comes from, counted from 1; 0 for what it is already.
+    /// Where a surface comes from: 0 for what it is already, [`OPINION`], or which of [`offsets`], counted from [`AROUND`].
     pub source: Vec<[u8; MOST]>,
     /// How unlike the images are; [`NEVER`] beyond `count`.
     pub cost: Vec<[f32; MOST]>,
 }
 
+/// Source of a surface that the second opinion proposes, and of the first that a pixel around does.
+pub(super) const OPINION: usize = 1;
+pub(super) const AROUND: usize = 2;
 /// No choice.
 pub(super) const NONE: u32 = u32::MAX;
 /// The cost of what is no choice; finite, so that differences are numbers.
@@ -194,11 +197,13 @@ fn slope(before: f32, here: f32, after: f32) -> f32 {
     }
 }
 
-/// What the pixels of a row may be: what they are, then the surfaces around, the nearest first.
+/// What the pixels of a row may be: what they are, what the second opinion takes them for, then the surfaces
+/// around, the nearest first.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 pub(super) fn propose(
     surfaces: &Surfaces,
     offsets: &[[isize; 2]],
+    opinion: Option<&[f32]>,
     moved: &Moved,
     [width, y]: [usize; 2],
     choices: &mut Choices,
@@ -211,7 +216,17 @@ pub(super) fn propose(
         }
         let here = surfaces.lanes(0, x as isize, y as isize);
         let mut farthest = [0.0f32; LANES];
-        for ([dx, dy], proposed) in offsets.iter().zip(&mut proposals) {
+        let [other, around @ ..] = &mut proposals;
+        *other = [f32::NAN; LANES];
+        for (i, d) in opinion
+            .into_iter()
+            .flat_map(|row| row[x..].iter().take(LANES).enumerate())
+        {
+            other[i] = *d;
+            let far = (d - here[i]).abs();
+            farthest[i] = if far > farthest[i] { far } else { farthest[i] };
+        }
+        for ([dx, dy], proposed) in offsets.iter().zip(around) {
             let (qx, qy) = (x as isize + dx, y as isize + dy);
             let d = surfaces.lanes(0, qx, qy);
             let (along_x, along_y) = (surfaces.lanes(1, qx, qy), surfaces.lanes(2, qx, qy));
@@ -228,7 +243,7 @@ pub(super) fn propose(
             most = if far > most { far } else { most };
         }
         if most > SAME {
-            choices.take_different(here, &proposals[..offsets.len()], x, width);
+            choices.take_different(here, &proposals, x, width);
         }
     }
 }
@@ -326,7 +341,7 @@ mod tests {
         let mut choices = Choices::default();
         let mut found = 0;
         for y in 0..height {
-            propose(&surfaces, &offsets, &all, [width, y], &mut choices);
+            propose(&surfaces, &offsets, None, &all, [width, y], &mut choices);
             for (k, &x) in choices.columns.iter().enumerate() {
                 let (x, own) = (x as usize, &choices.disparity[k]);
                 let own = &own[..usize::from(choices.count[k])];
@@ -335,7 +350,7 @@ mod tests {
                 assert!(own.len() >= 2);
                 for (i, a) in own.iter().enumerate() {
                     assert!(*a >= 0.0 && own[..i].iter().all(|b| (a - b).abs() > SAME));
-                    let Some(n) = usize::from(choices.source[k][i]).checked_sub(1) else {
+                    let Some(n) = usize::from(choices.source[k][i]).checked_sub(AROUND) else {
                         continue;
                     };
                     // Terraces rise by 0.1 a row and not along it, outside their edges.

@@ -139,7 +139,9 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let engines = EngineSettings {
         threads: settings.threads,
         outlines: settings.outlines,
-    };
+        second_opinion: None,
+    }
+    .streaming();
     let engine = load_engine(&settings.model, runtime, &engines)?;
     let name = engine.name();
     let stop = Arc::new(AtomicBool::new(false));

@@ -61,7 +61,7 @@ pub fn run(
     let reckoning = (args.dead_reckoning)
         .map(|form| Reckoning::new(source.sensors(), form, &config.fusion, &args.data))
         .transpose()?;
-    let engine = load_engine(&args.model, runtime, &args.engine)?;
+    let engine = load_engine(&args.model, runtime, &args.engine.streaming())?;
     out.write("config.toml", toml::to_string(&config)?)?;
     let mut log = RunLog::create(&out)?;
 
