@@ -84,7 +84,7 @@ fn training_is_watched_in_a_terminal() {
                 "\x1b[38;2;",
                 "disparity",
                 "/2 ",
-                "/s steps",
+                " steps/s",
                 "left",
                 "held-out",
             ]

@@ -349,3 +349,31 @@ fn a_full_disk_is_an_error() {
         assert!(told().is_err(), "{room}");
     }
 }
+
+#[cfg(feature = "rerun")]
+#[test]
+fn rerun_is_told_the_same() {
+    use ::rerun::log::{Chunk, LogMsg};
+    let (stream, stored) = super::rerun::builder().memory().unwrap();
+    let mut recording = Box::new(RerunRecording::to(stream));
+    told(&mut *recording).unwrap();
+    recording.finish().unwrap();
+    let messages = stored.take().into_iter();
+    let chunks = messages.filter_map(|message| match message {
+        LogMsg::ArrowMsg(_, message) => Some(Chunk::from_arrow_msg(&message).unwrap()),
+        _ => None,
+    });
+    let found: BTreeMap<String, usize> = chunks
+        .map(|c| (c.entity_path().to_string(), c.num_rows()))
+        .filter(|(path, _)| !path.starts_with("/__"))
+        .collect();
+    let wanted = [
+        "/camera/image",
+        "/camera/image/left",
+        "/map/cloud",
+        "/map/relief",
+        "/map/world",
+        "/map/world/route",
+    ];
+    assert_eq!(found, wanted.map(|path| (path.to_owned(), 1)).into());
+}

@@ -6,7 +6,7 @@ use barchan_train::{Explained, LogLine, Scored};
 use console::{Term, colors_enabled_stderr, true_colors_enabled_stderr};
 use image::imageops::{FilterType, resize};
 use image::{Rgb, RgbImage};
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::told_of;
 use crate::output::Output;
@@ -31,9 +31,13 @@ impl Live {
     /// `first` is the look at the held-out pairs before the first step, where there was one.
     pub fn new(output: &Output, [done, total]: [usize; 2], first: Option<Scored>) -> Self {
         let bar = output.progress("train", total);
-        let template = "{prefix} [{bar:30}] {pos}/{len}  {per_sec:>8} steps, {eta} left\n{msg}";
+        let template = "{prefix} [{bar:30}] {pos}/{len}  {speed} steps/s, {eta} left\n{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
-            bar.set_style(style.progress_chars("=> "));
+            let speed = |state: &ProgressState, to: &mut dyn std::fmt::Write| {
+                // Nobody hears of it if the bar cannot be drawn.
+                let _ = write!(to, "{:.2}", state.per_sec());
+            };
+            bar.set_style(style.with_key("speed", speed).progress_chars("=> "));
         }
         bar.set_position(done as u64);
         bar.reset_eta();
