@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Load for `barchan serve`: pairs at a steady rate, there and back along a rendered drive.
 
-    load.py BARCHAN [--model rover] [--size 484 366] [--rate 10] [--seconds 600] [--pairs COUNT]
+    load.py BARCHAN [--model rover] [--size 484 366] [--rate 10] [--seconds 600] [--pairs COUNT] [--config FILE]
 
 Sends each pair when it is due, whether or not the one before is answered, and says what was answered, how fast,
 and what the service has of memory on the way. Exits with 1 when an answer was lost. --rate 0 sends one after the
@@ -33,6 +33,7 @@ def main():
     parser.add_argument("--rate", type=float, default=10)
     parser.add_argument("--seconds", type=float, default=600)
     parser.add_argument("--pairs", type=int, help="instead of --seconds")
+    parser.add_argument("--config", type=Path, help="settings of the service")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         sys.exit(measure(options, Path(folder)))
@@ -46,6 +47,8 @@ def measure(options, folder):
     bodies = [form(data, i) for i in range(FRAMES)]
     command = [options.barchan, "serve", "--json", "--listen", "127.0.0.1:0", "--model", options.model]
     command += ["--rig", data / "rig.toml", "--runs", folder / "runs", "--keep-runs", "2", "--max-rate", "10000"]
+    if options.config:
+        command += ["--config", options.config]
     service = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     said = ""
     while not said.endswith("}\n"):

@@ -78,8 +78,7 @@ fn training_is_watched_in_a_terminal() {
         Err(_) => println!("skipped: there is no `script` to make a terminal with"),
         Ok(seen) => {
             let seen = String::from_utf8_lossy(&seen.stdout).into_owned();
-            let shows = |what: &str| assert!(seen.contains(what), "{what}: {seen}");
-            [
+            for what in [
                 "▀",
                 "\x1b[38;2;",
                 "disparity",
@@ -87,8 +86,9 @@ fn training_is_watched_in_a_terminal() {
                 " steps/s",
                 "left",
                 "held-out",
-            ]
-            .map(shows);
+            ] {
+                assert!(seen.contains(what), "{what}: {seen}");
+            }
             std::fs::remove_dir_all(&out).unwrap();
         }
     }
