@@ -21,7 +21,7 @@ TORCH = $(CACHE)/libtorch/2.9.1
 # What `make run` works on, and where it writes.
 DATA = synth:seed=1,frames=40
 OUT  = runs/demo
-# What `make accuracy` judges.
+# What `make accuracy` and `make load` judge.
 MODEL = rover
 
 PEERS := $(CACHE)/peers-$(shell sha256sum tests/peers/requirements.txt | cut -c 1-12)
@@ -29,7 +29,7 @@ TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/li
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data fuzz faults dist clean
+.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data fuzz faults load dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -61,6 +61,7 @@ lint: ## format, clippy, documentation and licences, warnings denied
 	cargo fmt --all --check
 	cargo clippy $(CARGO_BUILD) --all-targets -- -D warnings
 	$(PYTHON) scripts/licences.py > /dev/null
+	if cargo deny --version > /dev/null 2>&1; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: licences.py alone judged"; fi
 	RUSTDOCFLAGS="-D warnings" cargo doc $(CARGO_BUILD) --no-deps
 
 # The compiler counts the ways taken through the program, in a build folder of its own. Without the
@@ -81,6 +82,11 @@ fuzz: ## damaged files for every reader, FUZZ_SECONDS=60 each; what breaks one i
 KILLS = 50
 faults: ## KILLS=50 ends of train, slam and map at random moments: what was finished is whole
 	BARCHAN_KILLS=$(KILLS) cargo test $(CARGO_BUILD) --test end_to_end faults:: survival::killed -- --nocapture
+
+RATE    = 10
+SECONDS_OF_LOAD = 600
+load: build onnxruntime ## RATE=10 pairs a second of 484x366 into barchan serve, SECONDS_OF_LOAD=600: lost answers, times, memory
+	$(PYTHON) scripts/load.py "$(BARCHAN)" --model "$(MODEL)" --rate $(RATE) --seconds $(SECONDS_OF_LOAD)
 
 dist: ## the program without symbols and the licences of its crates, for packages (compiles the network library again)
 	cargo build --profile dist $(CARGO_FLAGS)

@@ -77,7 +77,9 @@ def wheel(folder: Path, requirement: str, sha256: str, tags: dict):
 
 
 def extract(archive: zipfile.ZipFile, member: str, to: Path) -> None:
-    """Writes one member of a wheel as the file `to`."""
+    """Writes one member of a wheel as the file `to`, which is made of the member's name at most."""
+    if ".." in Path(member).parts:
+        sys.exit(f"{archive.filename}: {member} lies outside the wheel")
     to.parent.mkdir(parents=True, exist_ok=True)
     with archive.open(member) as source, open(to, "wb") as target:
         shutil.copyfileobj(source, target, 1 << 20)

@@ -158,6 +158,44 @@ impl StagedDir {
     }
 }
 
+/// An output file that appears whole or not at all: written under a neighbouring name, which is removed when the
+/// end is not reached.
+pub struct StagedFile {
+    stage: PathBuf,
+    target: PathBuf,
+}
+
+impl StagedFile {
+    /// Prepares to write `target`.
+    pub fn new(target: &Path) -> Self {
+        Self {
+            stage: beside(target, ".part"),
+            target: target.to_owned(),
+        }
+    }
+
+    /// Where it is written till then.
+    pub fn path(&self) -> &Path {
+        &self.stage
+    }
+
+    /// Gives the file its name, when all of it is on disk; its size in bytes.
+    pub fn finish(self) -> Result<u64> {
+        let context = || self.target.display().to_string();
+        let file = std::fs::File::open(&self.stage).with_context(context)?;
+        file.sync_all().with_context(context)?;
+        std::fs::rename(&self.stage, &self.target).with_context(context)?;
+        Ok(file.metadata().with_context(context)?.len())
+    }
+}
+
+impl Drop for StagedFile {
+    fn drop(&mut self) {
+        // After `finish` there is nothing left here.
+        let _ = std::fs::remove_file(&self.stage);
+    }
+}
+
 /// The path with `ending` after its last name.
 fn beside(path: &Path, ending: &str) -> PathBuf {
     let mut name = path.components().as_path().as_os_str().to_owned();

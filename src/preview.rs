@@ -27,6 +27,20 @@ pub fn disparity_picture(disparity: &Plane, range: (f32, f32)) -> RgbImage {
     })
 }
 
+/// How probable it is that a disparity is right to a pixel, in grey: certain is white, unknown is black. `sigma` is the
+/// deviation of errors that are spread as Laplace's distribution has it.
+pub fn certainty_picture(disparity: &Plane, sigma: &Plane) -> RgbImage {
+    let (width, height) = disparity.dimensions();
+    RgbImage::from_fn(width, height, |x, y| {
+        let known = disparity.get_pixel(x, y).0[0].is_finite();
+        let sigma = sigma.get_pixel_checked(x, y).map_or(f32::NAN, |s| s.0[0]);
+        let share = 1.0 - (-std::f32::consts::SQRT_2 / sigma).exp();
+        // NaN becomes 0.
+        let grey = if known { (255.0 * share) as u8 } else { 0 };
+        image::Rgb([grey; 3])
+    })
+}
+
 fn disparity_colour(disparity: f32, (low, high): (f32, f32)) -> image::Rgb<u8> {
     match disparity.is_finite() {
         true => turbo((disparity - low) / (high - low).max(1e-6)),

@@ -92,15 +92,34 @@ impl RunLog {
         })
     }
 
-    /// Adds the report of a frame.
+    /// Adds the report of a frame, and what the program has of memory after it.
     pub fn add(&mut self, report: &impl Serialize) -> Result<()> {
-        writeln!(self.file, "{}", serde_json::to_string(report)?).context("log.jsonl")
+        #[derive(Serialize)]
+        struct Line<'a, R> {
+            #[serde(flatten)]
+            report: &'a R,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            mb_resident: Option<f64>,
+        }
+        let line = Line {
+            report,
+            mb_resident: resident_megabytes(),
+        };
+        writeln!(self.file, "{}", serde_json::to_string(&line)?).context("log.jsonl")
     }
 
     /// Writes what is left.
     pub fn finish(mut self) -> Result<()> {
         self.file.flush().context("log.jsonl")
     }
+}
+
+/// What this process has of memory, where the system tells.
+fn resident_megabytes() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"))?;
+    let kib: f64 = line.split_whitespace().next()?.parse().ok()?;
+    Some((kib * 1.024).round() / 1e3)
 }
 
 /// A run on disk whose key frames have disparity.

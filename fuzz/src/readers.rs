@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 
 use barchan_datasets::{
     Correction, Plane, StereoSource, Synth, disparity_file, load_rig, open, parse_rgb, read_planar,
-    write_synth,
+    write_katwijk, write_synth,
 };
 use barchan_geometry::{RectifiedRig, Rig, Trajectory};
 use barchan_onnx::proto::ValueInfo;
@@ -90,14 +90,38 @@ pub const READERS: &[Reader] = &[
     reader(
         "sensors",
         "imu.csv",
-        |_, b| folder("imu.csv", b),
-        || sensor("imu.csv"),
+        |_, b| FOLDER.opens_with("imu.csv", b),
+        || FOLDER.table("imu.csv"),
+    ),
+    reader(
+        "gnss",
+        "gnss.csv",
+        |_, b| FOLDER.opens_with("gnss.csv", b),
+        || FOLDER.table("gnss.csv"),
     ),
     reader(
         "times",
         "times.txt",
-        |_, b| folder("times.txt", b),
+        |_, b| FOLDER.opens_with("times.txt", b),
         || texts(&["0\n0.1\n"]),
+    ),
+    reader(
+        "katwijk-imu",
+        "imu.txt",
+        |_, b| KATWIJK.opens_with("imu.txt", b),
+        || KATWIJK.table("imu.txt"),
+    ),
+    reader(
+        "katwijk-wheels",
+        "odometry.txt",
+        |_, b| KATWIJK.opens_with("odometry.txt", b),
+        || KATWIJK.table("odometry.txt"),
+    ),
+    reader(
+        "katwijk-fixes",
+        "gps-utm31.txt",
+        |_, b| KATWIJK.opens_with("gps-utm31.txt", b),
+        || KATWIJK.table("gps-utm31.txt"),
     ),
     reader(
         "onnx",
@@ -287,42 +311,60 @@ fn synth() -> Box<dyn StereoSource> {
     open.unwrap_or_else(|e| unreachable!("a rendered sequence needs no file: {e}"))
 }
 
-/// A folder of pairs whose other files are replaced.
-static FOLDER: LazyLock<Option<tempfile::TempDir>> = LazyLock::new(|| {
+/// A rendered data set whose other files are replaced.
+struct Rendered {
+    format: &'static str,
+    /// `None` where it could not be written.
+    dir: LazyLock<Option<tempfile::TempDir>>,
+}
+
+static FOLDER: Rendered = Rendered {
+    format: "folder",
+    dir: LazyLock::new(|| written_data(|s, d| write_synth(s, d, |_| ()).is_ok())),
+};
+static KATWIJK: Rendered = Rendered {
+    format: "katwijk",
+    dir: LazyLock::new(|| written_data(|s, d| write_katwijk(s, d, 0.0, |_| ()).is_ok())),
+};
+
+fn written_data(write: impl FnOnce(&Synth, &Path) -> bool) -> Option<tempfile::TempDir> {
     let dir = tempfile::tempdir().ok()?;
     let source = Synth::parse("seed=3,frames=2,width=96,height=64").ok()?;
-    write_synth(&source, &dir.path().join("d"), |_| ()).ok()?;
-    Some(dir)
-});
-
-fn folder_path() -> Option<PathBuf> {
-    Some(FOLDER.as_ref()?.path().join("d"))
+    write(&source, &dir.path().join("d")).then_some(dir)
 }
 
-fn folder(name: &str, bytes: &[u8]) -> bool {
-    let Some(folder) = folder_path() else {
-        return false;
-    };
-    let file = folder.join(name);
-    let whole = std::fs::read(&file);
-    let read = std::fs::write(&file, bytes).is_ok()
-        && open(&format!("folder:{}", folder.display())).is_ok();
-    // The others of the folder are read with it: what is damaged must not stay.
-    let restored = match whole {
-        Ok(whole) => std::fs::write(&file, whole),
-        Err(_) => std::fs::remove_file(&file),
-    };
-    read && restored.is_ok()
-}
+impl Rendered {
+    fn path(&self) -> Option<PathBuf> {
+        Some(self.dir.as_ref()?.path().join("d"))
+    }
 
-fn sensor(name: &str) -> Vec<Vec<u8>> {
-    let bytes = folder_path().and_then(|f| std::fs::read(f.join(name)).ok());
-    let mut bytes = bytes.unwrap_or_default();
-    // Whole lines: the seed must be one that is read.
-    bytes.truncate(2000);
-    let lines = bytes.iter().rposition(|b| *b == b'\n');
-    bytes.truncate(lines.map_or(0, |end| end + 1));
-    vec![bytes]
+    /// Whether it can be read with these bytes for one of its files.
+    fn opens_with(&self, name: &str, bytes: &[u8]) -> bool {
+        let Some(folder) = self.path() else {
+            return false;
+        };
+        let file = folder.join(name);
+        let whole = std::fs::read(&file);
+        let read = std::fs::write(&file, bytes).is_ok()
+            && open(&format!("{}:{}", self.format, folder.display())).is_ok();
+        // The others of the folder are read with it: what is damaged must not stay.
+        let restored = match whole {
+            Ok(whole) => std::fs::write(&file, whole),
+            Err(_) => std::fs::remove_file(&file),
+        };
+        read && restored.is_ok()
+    }
+
+    /// The beginning of one of its tables.
+    fn table(&self, name: &str) -> Vec<Vec<u8>> {
+        let bytes = self.path().and_then(|f| std::fs::read(f.join(name)).ok());
+        let mut bytes = bytes.unwrap_or_default();
+        // Whole lines: the seed must be one that is read.
+        bytes.truncate(2000);
+        let lines = bytes.iter().rposition(|b| *b == b'\n');
+        bytes.truncate(lines.map_or(0, |end| end + 1));
+        vec![bytes]
+    }
 }
 
 fn rig_toml() -> String {

@@ -1,17 +1,19 @@
-//! A run as one HTML file that needs no network: figures, charts, pictures, a cloud that turns, a relief that tells
-//! heights.
+//! A run for people to look at: as one HTML file that needs no network (figures, charts, pictures, a cloud that turns,
+//! a relief that tells heights), or as a recording that a viewer plays.
 //!
 //! What it is for: a [`Report`] is filled by whoever knows what a run holds, and [`Report::html`] makes the page; a
-//! [`Chart`] and a [`Sheet`] of pictures are SVG files alone as well.
+//! [`Chart`] and a [`Sheet`] of pictures are SVG files alone as well. A [`Recording`] is told a run piece by piece:
+//! [`FoxgloveRecording`] for Foxglove, and with the feature `rerun` `RerunRecording` for Rerun.
 //!
-//! What it promises: everything is inside the file; text is escaped, whatever names the data has; the size is
+//! What it promises: everything is inside the page; text is escaped, whatever names the data has; the size is
 //! bounded (at most [`MAX_POINTS`] points, [`MAX_CELLS`] cells and [`MAX_SAMPLES`] marks a line), and the page says where that
-//! left something out.
+//! left something out. A recording is written as it is told, in memory that does not grow with the run.
 //!
 //! What it never does: read runs, or judge them.
 
 mod chart;
 mod cloud;
+mod recording;
 mod relief;
 mod sheet;
 
@@ -24,10 +26,13 @@ use serde::Serialize;
 
 pub use chart::{Chart, MAX_SAMPLES, Series, Style};
 pub use cloud::{Cloud3d, MAX_POINTS};
+#[cfg(feature = "rerun")]
+pub use recording::RerunRecording;
+pub use recording::{FoxgloveRecording, Recording};
 pub use relief::{MAX_CELLS, Relief};
 pub use sheet::Sheet;
 
-/// Why a page could not be made.
+/// Why a page or a recording could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
     /// A picture could not be encoded.
@@ -44,6 +49,22 @@ pub enum ReportError {
     /// The page could not be put together.
     #[error("the page of the report: {0}")]
     Page(#[from] minijinja::Error),
+    /// The recording could not be written.
+    #[error("the recording: {0}")]
+    Recording(#[from] std::io::Error),
+    /// What the Rerun viewer's library said.
+    #[cfg(feature = "rerun")]
+    #[error("Rerun: {0}")]
+    Rerun(#[from] ::rerun::RecordingStreamError),
+    /// The viewer, or its file, took not all of it.
+    #[error("the recording: {0}")]
+    Viewer(String),
+    /// A message could not be put together.
+    #[error("a message of the recording: {0}")]
+    Message(#[from] serde_json::Error),
+    /// A recording has no such time.
+    #[error("the recording: time is {0} s, expected 0 (the beginning of 1970) to 4294967295")]
+    Time(f64),
 }
 
 /// What a page shows, in this order; empty parts are left away.
@@ -119,6 +140,12 @@ impl Report {
 
 fn jpeg(picture: &RgbImage) -> Result<String, ReportError> {
     data_uri(picture, ImageFormat::Jpeg)
+}
+
+fn jpeg_bytes(picture: &RgbImage) -> Result<Vec<u8>, ReportError> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Jpeg)?;
+    Ok(bytes.into_inner())
 }
 
 fn data_uri(picture: &RgbImage, format: ImageFormat) -> Result<String, ReportError> {

@@ -36,45 +36,90 @@ pub(crate) struct Packed {
     pub bound: Option<String>,
 }
 
+/// Every n-th cell in each direction, so that they are at most [`MAX_CELLS`].
+pub(crate) struct Thinned<'a> {
+    relief: &'a Relief,
+    every: usize,
+    pub width: usize,
+    pub height: usize,
+    pub west: f64,
+    pub north: f64,
+    pub cell: [f64; 2],
+    pub low: f32,
+    pub high: f32,
+}
+
 impl Relief {
-    pub(crate) fn pack(&self) -> Result<Packed, ReportError> {
+    pub(crate) fn thinned(&self) -> Thinned<'_> {
         let grid = self.elevation.grid;
         let every = ((grid.width * grid.height) as f64 / MAX_CELLS as f64)
             .sqrt()
             .ceil();
         let every = (every as usize).max(1);
-        let (width, height) = (grid.width.div_ceil(every), grid.height.div_ceil(every));
-        let at = |column: usize, row: usize| row * every * grid.width + column * every;
-        let cells = || (0..height).flat_map(|row| (0..width).map(move |column| at(column, row)));
-
         let (low, high) = spread(&self.elevation.values);
-        let picture = RgbImage::from_fn(width as u32, height as u32, |column, row| {
-            let cell = at(column as usize, row as usize);
-            let known = self.elevation.values.get(cell).filter(|z| z.is_finite());
-            let shade = self.shade.values.get(cell).copied().unwrap_or(0);
-            known.map_or(Rgb([255; 3]), |z| tinted((z - low) / (high - low), shade))
-        });
-        let bytes = |raster: &Raster<f32>| -> String {
-            let value = |cell| raster.values.get(cell).copied().unwrap_or(f32::NAN);
-            base64(
-                &cells()
-                    .flat_map(|c| value(c).to_le_bytes())
-                    .collect::<Vec<u8>>(),
-            )
-        };
-        Ok(Packed {
-            width,
-            height,
+        Thinned {
+            relief: self,
             every,
+            width: grid.width.div_ceil(every),
+            height: grid.height.div_ceil(every),
             west: grid.west,
             north: grid.north,
             cell: [grid.cell_x, grid.cell_y].map(|c| c * every as f64),
             low,
             high,
+        }
+    }
+
+    pub(crate) fn pack(&self) -> Result<Packed, ReportError> {
+        let cells = self.thinned();
+        let picture = RgbImage::from_fn(cells.width as u32, cells.height as u32, |column, row| {
+            Rgb(cells.colour_at(column as usize, row as usize))
+        });
+        let places = || (0..cells.height).flat_map(|row| (0..cells.width).map(move |c| (c, row)));
+        let bytes = |raster: &Raster<f32>| -> String {
+            let values = places().flat_map(|(c, r)| cells.value(raster, c, r).to_le_bytes());
+            base64(&values.collect::<Vec<u8>>())
+        };
+        Ok(Packed {
+            width: cells.width,
+            height: cells.height,
+            every: cells.every,
+            west: cells.west,
+            north: cells.north,
+            cell: cells.cell,
+            low: cells.low,
+            high: cells.high,
             picture: data_uri(&picture, ImageFormat::Png)?,
             elevation: bytes(&self.elevation),
             bound: self.bound.as_ref().map(bytes),
         })
+    }
+}
+
+impl Thinned<'_> {
+    fn index(&self, column: usize, row: usize) -> usize {
+        row * self.every * self.relief.elevation.grid.width + column * self.every
+    }
+
+    fn value(&self, raster: &Raster<f32>, column: usize, row: usize) -> f32 {
+        let value = raster.values.get(self.index(column, row));
+        value.copied().unwrap_or(f32::NAN)
+    }
+
+    /// Elevation, metres; NaN where unknown.
+    pub fn height_at(&self, column: usize, row: usize) -> f32 {
+        self.value(&self.relief.elevation, column, row)
+    }
+
+    /// Coloured by height and shaded; white where unknown.
+    pub fn colour_at(&self, column: usize, row: usize) -> [u8; 3] {
+        let height = self.height_at(column, row);
+        if !height.is_finite() {
+            return [u8::MAX; 3];
+        }
+        let shade = self.relief.shade.values.get(self.index(column, row));
+        let share = (height - self.low) / (self.high - self.low);
+        tinted(share, shade.copied().unwrap_or(0))
     }
 }
 
@@ -89,12 +134,12 @@ fn spread(values: &[f32]) -> (f32, f32) {
     }
 }
 
-fn tinted(height: f32, shade: u8) -> Rgb<u8> {
+fn tinted(height: f32, shade: u8) -> [u8; 3] {
     let colour = colorous::VIRIDIS.eval_continuous(f64::from(height.clamp(0.0, 1.0)));
     // At the rim there is height but no slope.
     let light = match shade {
         0 => 0.9,
         shade => 0.25 + 0.95 * f32::from(shade) / 255.0,
     };
-    Rgb([colour.r, colour.g, colour.b].map(|c| (f32::from(c) * light).min(255.0) as u8))
+    [colour.r, colour.g, colour.b].map(|c| (f32::from(c) * light).min(255.0) as u8)
 }

@@ -163,6 +163,13 @@ impl Slam {
         self
     }
 
+    /// Ends without the bundle adjustment of the whole map (`adjust_all`), whose time grows with the cube of the key
+    /// frames that see the same points.
+    pub fn without_last_adjustment(mut self) -> Self {
+        self.config.adjust_all = false;
+        self
+    }
+
     /// Goes on in a map made before, by the same rig and detector: the first frames are looked for in
     /// it. To be called before the first frame; then `with_vocabulary` comes before.
     pub fn with_map(mut self, map: Map) -> Self {

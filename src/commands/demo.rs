@@ -1,9 +1,9 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Parser;
 
-use crate::commands::{data, eval, map, report, slam};
+use crate::commands::{data, eval, map, report, slam, train};
 use crate::engine::DEFAULT_MODEL;
 use crate::output::Output;
 
@@ -11,7 +11,8 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan demo\n  \
-    barchan demo --data folder:my_images --out day1")]
+    barchan demo --data folder:my_images --out day1\n  \
+    barchan demo --data folder:my_images --finetune --out day1")]
 pub struct Args {
     /// Your images; a rendered traverse without
     #[arg(long, value_name = "DATA")]
@@ -19,6 +20,9 @@ pub struct Args {
     /// What sees disparity: x.onnx, x.safetensors, sgm, bm or a shipped name
     #[arg(long, default_value = DEFAULT_MODEL)]
     model: String,
+    /// Lets the network learn from the images first, one epoch; they need no truth. Some minutes for 300 pairs
+    #[arg(long, requires = "data")]
+    finetune: bool,
     /// The directory that is written
     #[arg(long, value_name = "DIR", default_value = "demo")]
     out: PathBuf,
@@ -46,14 +50,20 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             format!("folder:{rendered}")
         }
     };
+    let weights = inside("train/weights.safetensors");
+    let model = match args.finetune {
+        true => {
+            let words = learn(&args, &data);
+            let words: Vec<&str> = words.iter().map(String::as_str).collect();
+            if !train::run(typed(output, &words)?, output)? {
+                bail!("the training was stopped\n  cure: the same command goes on with it");
+            }
+            &weights
+        }
+        false => &args.model,
+    };
     let command = [
-        "slam",
-        "--data",
-        &data,
-        "--model",
-        &args.model,
-        "--out",
-        &slam_run,
+        "slam", "--data", &data, "--model", model, "--out", &slam_run,
     ];
     slam::run(typed(output, &command)?, output, runtime)?;
     map::run(
@@ -77,15 +87,35 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         "\nWhere to look:\n  {page}  everything on one page (any browser)\n  {map_dir}/cloud.ply  the ground in colour (CloudCompare, MeshLab)\n  \
          {map_dir}/dem.tif  its heights, and hillshade.tif beside it (QGIS)\n  {slam_run}/trajectory.tum  the route (evo)"
     ));
-    if args.data.is_some() {
-        let train = inside("train");
+    if args.data.is_some() && !args.finetune {
         output.say(&format!(
             "\nThe network has not seen your ground. To let it learn from these images (they need no truth), and then again:\n  \
-             barchan train --finetune --data {data} --out {train}\n  barchan demo --data {data} --model {train}/weights.safetensors --out {}",
+             barchan demo --data {data} --finetune --out {}",
             args.out.display()
         ));
     }
     Ok(())
+}
+
+/// The training, or what goes on with one that was stopped.
+fn learn(args: &Args, data: &str) -> Vec<String> {
+    let run = args.out.join("train");
+    let (known, run) = (run.join("config.toml").is_file(), run.display().to_string());
+    let words = match (known, args.model.as_str()) {
+        (true, _) => vec!["train", "--resume", &run],
+        (false, DEFAULT_MODEL) => vec!["train", "--finetune", "--data", data, "--out", &run],
+        (false, model) => vec![
+            "train",
+            "--finetune",
+            "--init",
+            model,
+            "--data",
+            data,
+            "--out",
+            &run,
+        ],
+    };
+    words.into_iter().map(str::to_owned).collect()
 }
 
 /// A command as anybody could type it, said before it is done.

@@ -18,4 +18,5 @@ pub mod report;
 pub mod serve;
 pub mod slam;
 pub mod train;
+pub mod view;
 pub mod vocabulary;

@@ -8,12 +8,14 @@ use barchan_geometry::nalgebra::{Point3, Vector3};
 use barchan_report::{Chart, Cloud3d, Relief, Report, Series, Style};
 use barchan_terrain::{Cloud, Grid, Raster};
 use clap::Parser;
+use image::RgbImage;
+use image::imageops::replace;
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::commands::eval::read_trajectory;
 use crate::output::Output;
-use crate::preview::{disparity_beside_image, disparity_range};
+use crate::preview::{certainty_picture, disparity_beside_image, disparity_range};
 
 /// A run as one HTML file that needs no network
 #[derive(Parser)]
@@ -44,16 +46,9 @@ struct Summary {
 const PICTURES: usize = 6;
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
-    let inside = |name: &str| Some(args.run.join(name)).filter(|p| p.exists());
-    let slam = inside("slam").unwrap_or_else(|| args.run.clone());
-    let map = args.map.clone().or_else(|| inside("map"));
-    let truth = args.gt.clone().or_else(|| inside("data/groundtruth.tum"));
-    if !slam.join("trajectory.tum").is_file() {
-        bail!(
-            "{}: no run of `barchan slam` (there is no trajectory.tum)\n  cure: `barchan slam --data DATA --out {0}` makes one",
-            slam.display()
-        );
-    }
+    let (slam, map) = parts(&args.run, args.map.clone())?;
+    let truth = args.run.join("data/groundtruth.tum");
+    let truth = (args.gt.clone()).or_else(|| truth.is_file().then_some(truth));
     let out = args.out.unwrap_or_else(|| args.run.join("report.html"));
     let mut report = Report {
         title: format!("Barchan: {}", name_of(out.parent().unwrap_or(&out))),
@@ -177,6 +172,16 @@ fn add_run(report: &mut Report, slam: &Path) -> Result<()> {
         .filter(|s| !s.samples.is_empty())
         .collect(),
     });
+    let memory = line("of the whole program", "mb_resident");
+    if !memory.samples.is_empty() {
+        report.charts.push(Chart {
+            title: "Memory".into(),
+            horizontal: "frame".into(),
+            vertical: "MB".into(),
+            plan: false,
+            series: vec![memory],
+        });
+    }
     for event in summary["loop_events"].as_array().into_iter().flatten() {
         let place = &event["earlier_frame"];
         let moved = event["moved"].as_f64().unwrap_or_default();
@@ -273,7 +278,7 @@ fn add_route(report: &mut Report, slam: &Path, truth: Option<&Path>) -> Result<(
     Ok(())
 }
 
-/// Some key frames: image, disparity.
+/// Some key frames: image, disparity, and how sure that is.
 fn add_pictures(report: &mut Report, slam: &Path) -> Result<()> {
     let folder = slam.join("keyframes/disparity");
     let Ok(entries) = folder.read_dir() else {
@@ -283,18 +288,29 @@ fn add_pictures(report: &mut Report, slam: &Path) -> Result<()> {
     files.sort();
     let every = files.len().div_ceil(PICTURES).max(1);
     for file in files.iter().step_by(every) {
-        let left = read_rgb(
-            &slam
-                .join("keyframes/left")
-                .join(file.file_name().unwrap_or_default()),
-        )?;
+        let beside = |folder: &str| {
+            let name = file.file_name().unwrap_or_default();
+            slam.join("keyframes").join(folder).join(name)
+        };
+        let left = read_rgb(&beside("left"))?;
         let disparity = disparity_file::read(file)?;
-        let picture = disparity_beside_image(&left, &disparity, disparity_range(&disparity));
+        let both = disparity_beside_image(&left, &disparity, disparity_range(&disparity));
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
-        report.pictures.push((
-            format!("frame {name}: image, disparity (red is near, black is rejected)"),
-            picture,
-        ));
+        let mut caption =
+            format!("frame {name}: image, disparity (red is near, black is rejected)");
+        let sigma = beside("sigma");
+        let picture = match sigma.is_file() {
+            false => both,
+            true => {
+                let sure = certainty_picture(&disparity, &disparity_file::read(&sigma)?);
+                caption += ", confidence (white is right to a pixel)";
+                let mut three = RgbImage::new(both.width() + sure.width(), both.height());
+                replace(&mut three, &both, 0, 0);
+                replace(&mut three, &sure, both.width().into(), 0);
+                three
+            }
+        };
+        report.pictures.push((caption, picture));
     }
     Ok(())
 }
@@ -317,6 +333,29 @@ fn half_bands(file: &Path, grid: &Grid) -> Result<Option<Raster<f32>>> {
         values: half.map(|(low, high)| 0.5 * (high - low)).collect(),
     };
     Ok(Some(half.onto(grid)))
+}
+
+/// The heights of a map of `barchan map`.
+pub fn relief(map: &Path) -> Result<Relief> {
+    let elevation = Raster::read(&map.join("dem.tif"))?;
+    Ok(Relief {
+        bound: half_bands(&map.join("elevation.tif"), &elevation.grid)?,
+        shade: Raster::read(&map.join("hillshade.tif"))?,
+        elevation,
+    })
+}
+
+/// Where the run and the map of a folder are: the folder itself or `slam` in it, what is given or `map` in it.
+pub fn parts(folder: &Path, map: Option<PathBuf>) -> Result<(PathBuf, Option<PathBuf>)> {
+    let inside = |name: &str| Some(folder.join(name)).filter(|p| p.exists());
+    let slam = inside("slam").unwrap_or_else(|| folder.to_owned());
+    if !slam.join("trajectory.tum").is_file() {
+        bail!(
+            "{}: no run of `barchan slam` (there is no trajectory.tum)\n  cure: `barchan slam --data DATA --out {0}` makes one",
+            slam.display()
+        );
+    }
+    Ok((slam, map.or_else(|| inside("map"))))
 }
 
 /// Cloud and relief.
@@ -343,12 +382,7 @@ fn add_map(report: &mut Report, map: &Path, slam: &Path) -> Result<()> {
         points: Cloud::read_ply(&map.join("cloud.ply"))?.points,
         route: route.iter().map(place).collect(),
     });
-    let elevation = Raster::read(&map.join("dem.tif"))?;
-    report.relief = Some(Relief {
-        bound: half_bands(&map.join("elevation.tif"), &elevation.grid)?,
-        shade: Raster::read(&map.join("hillshade.tif"))?,
-        elevation,
-    });
+    report.relief = Some(relief(map)?);
     report.source = format!("{} and {}", slam.display(), map.display());
     Ok(())
 }

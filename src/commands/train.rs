@@ -1,3 +1,4 @@
+mod live;
 mod loss_args;
 
 use std::path::{Path, PathBuf};
@@ -12,7 +13,6 @@ use barchan_train::{
     TrainError, Trainer,
 };
 use clap::{Parser, ValueEnum};
-use indicatif::ProgressBar;
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
@@ -21,6 +21,7 @@ use crate::data::{Unchecked, open_checked};
 use crate::engine::load_net;
 use crate::output::Output;
 use crate::preview::{explained_sheet, png};
+use live::Live;
 use loss_args::LossArgs;
 
 /// Exit status after Ctrl-C, as shells have it: scripts that go on after success stop here.
@@ -217,11 +218,9 @@ pub fn run(args: Args, output: &Output) -> Result<bool> {
         }
     };
     let (done, total) = trainer.progress();
-    let bar = output.progress("train", total);
-    bar.set_position(done as u64);
     let mut watch = Watch {
         output,
-        bar,
+        live: Live::new(output, [done, total], trainer.before()),
         total,
         run: RunDir::open(&root)?.0,
         before: trainer.before(),
@@ -230,7 +229,7 @@ pub fn run(args: Args, output: &Output) -> Result<bool> {
         stop: stop_at_signal()?,
     };
     let outcome = trainer.run(&mut watch);
-    watch.bar.finish_and_clear();
+    watch.live.finish();
     match outcome {
         Ok(Ended::Finished {
             before,
@@ -273,7 +272,7 @@ fn stop_at_signal() -> Result<Arc<AtomicBool>> {
 /// Tells the user, draws pictures, and listens for Ctrl-C.
 struct Watch<'a> {
     output: &'a Output,
-    bar: ProgressBar,
+    live: Live,
     total: usize,
     run: RunDir,
     before: Option<Scored>,
@@ -308,18 +307,14 @@ impl Observer for Watch<'_> {
     fn step(&mut self, line: &LogLine) {
         self.seconds += line.seconds + line.waited;
         self.steps += 1;
-        let told = format!(
-            "loss {:.4}  {:.2} s/step",
-            line.loss,
-            self.seconds_per_step()
-        );
-        self.bar.inc(1);
-        if self.bar.is_hidden() && (line.step.is_multiple_of(50) || line.step == self.total) {
+        self.live.step(line);
+        if self.live.is_hidden() && (line.step.is_multiple_of(50) || line.step == self.total) {
             let (step, total, terms) = (line.step, self.total, &line.terms);
-            self.output
-                .say(&format!("step {step}/{total}  {told}  {terms}"));
+            let (loss, seconds) = (line.loss, self.seconds_per_step());
+            self.output.say(&format!(
+                "step {step}/{total}  loss {loss:.4}  {seconds:.2} s/step  {terms}"
+            ));
         }
-        self.bar.set_message(told);
     }
 
     fn validated(
@@ -337,11 +332,12 @@ impl Observer for Watch<'_> {
             .sample(&format!("{:08}.png", scored.step), &sheet)?;
         if scored.step > 0 && scored.step < self.total {
             let told = format!("step {}  held-out {}", scored.step, told_of(scored));
-            match self.bar.is_hidden() {
+            match self.live.is_hidden() {
                 true => self.output.say(&told),
-                false => self.bar.println(told),
+                false => self.live.say(&told),
             }
         }
+        self.live.validated(scored, best, pairs);
         Ok(())
     }
 

@@ -169,6 +169,14 @@ fn a_full_disk_is_said_and_leaves_nothing_half_written() {
         )),
         words(&format!("export tiny --out {out}.onnx")),
         words(&format!(
+            "view {} --mcap {out}.mcap",
+            text(&case.path("run"))
+        )),
+        words(&format!(
+            "report {} --out {out}.html",
+            text(&case.path("run"))
+        )),
+        words(&format!(
             "data synth synth:seed=3,frames=2,width=192,height=128 --out {out}"
         )),
     ];
@@ -198,6 +206,7 @@ fn a_folder_that_cannot_be_written_is_named() {
         vec!["slam", "--model", "sgm:64", "--data", data],
         vec!["train", "--steps", "1", "--data", data],
         vec!["map", text(&case.path("run"))],
+        vec!["report", text(&case.path("run"))],
         vec!["data", "synth", "synth:seed=3,frames=2"],
         vec!["export", "tiny"],
     ] {

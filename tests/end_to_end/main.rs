@@ -15,3 +15,4 @@ mod serve;
 mod settings;
 mod smoke;
 mod survival;
+mod view;

@@ -1,7 +1,7 @@
 """barchan's outputs against programs nobody here wrote. `make peers` runs this.
 
 Trains for a moment on a rendered traverse, exports, infers, tracks and maps, and holds every file
-against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile, laspy, pypcd4, Open3D, small_gicp and a browser.
+against ONNX Runtime, onnx, evo, GDAL, OpenCV, plyfile, laspy, pypcd4, Open3D, small_gicp, mcap and a browser.
 Real images and published trajectories join where ../shared/data has them. Exits 1 when a figure is out of
 bounds or a check fails to run.
 """
@@ -17,6 +17,7 @@ import matching
 import network
 import page
 import rasters
+import recordings
 import speed
 import trajectory
 from common import Barchan, Table
@@ -84,10 +85,13 @@ def main() -> None:
     def browser(table: Table) -> None:
         page.check(table, barchan, work / "slam", work / "map", work)
 
+    def viewers(table: Table) -> None:
+        recordings.check(table, barchan, work / "slam", work / "map", work)
+
     def timings(table: Table) -> None:
         speed.report(barchan, work)
 
-    checks = [exported, engines, matchers, key_points, trajectories, terrain, formats, registration, browser]
+    checks = [exported, engines, matchers, key_points, trajectories, terrain, formats, registration, browser, viewers]
     Table().run([prepare, *checks, timings])
 
 

@@ -1,7 +1,7 @@
 //! Runs on disk, of which the newest are kept: what `barchan slam` would have left of the same pairs.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -77,7 +77,11 @@ impl Ring {
         let runs = ring.runs()?;
         for old in &runs[..runs.len().saturating_sub(ring.keep)] {
             let path = ring.folder.join(format!("run-{old:06}"));
-            std::fs::remove_dir_all(&path).with_context(|| path.display().to_string())?;
+            match std::fs::remove_dir_all(&path) {
+                // Another run ended at the same time and was first.
+                Err(e) if e.kind() == ErrorKind::NotFound => {}
+                removed => removed.with_context(|| path.display().to_string())?,
+            }
         }
         Ok(())
     }

@@ -219,7 +219,7 @@ impl Station {
         if let Some(tracking) = &self.tracking {
             let mut tracking = locked(tracking);
             tracking.end_run(&self.metrics);
-            if let Some(writer) = tracking.writer.take() {
+            for writer in std::mem::take(&mut tracking.writers) {
                 // One that panicked has said so.
                 let _ = writer.join();
             }
@@ -265,9 +265,15 @@ struct Tracking {
     run: Option<Run>,
     /// How often a run was begun.
     number: usize,
-    /// Finishes the run before.
-    writer: Option<JoinHandle<()>>,
+    /// Key frames of this run.
+    run_keyframes: usize,
+    /// Finish the runs before.
+    writers: Vec<JoinHandle<()>>,
 }
+
+/// A run of more key frames is recorded without the adjustment of its whole map: where all of them see the same, as
+/// when a rover works in one place, its time grows with the cube of their number and takes minutes from here on.
+const MOST_ADJUSTED: usize = 600;
 
 impl Tracking {
     fn new(settings: &Settings, rig: RectifiedRig) -> Result<Self> {
@@ -286,7 +292,8 @@ impl Tracking {
             ring,
             run: None,
             number: 0,
-            writer: None,
+            run_keyframes: 0,
+            writers: vec![],
             settings: settings.clone(),
         })
     }
@@ -316,6 +323,7 @@ impl Tracking {
             self.voxels.insert(&cloud.transform(&pose));
             self.first_pose.get_or_insert(pose);
             self.keyframes += 1;
+            self.run_keyframes += 1;
         }
         if let Some(run) = &mut self.run
             && let Err(e) = run.add(&report)
@@ -360,19 +368,22 @@ impl Tracking {
         }
     }
 
-    /// Hands the run to a thread that finishes it, and makes everything ready for the next.
+    /// Hands the run to a thread that finishes it, and makes everything ready for the next. Nobody waits for it.
     fn end_run(&mut self, metrics: &Arc<Metrics>) {
         let slam = begin(&self.settings, self.rig, &self.handed);
-        let slam = std::mem::replace(&mut self.slam, slam);
+        let mut slam = std::mem::replace(&mut self.slam, slam);
         self.frames = 0;
+        let keyframes = std::mem::take(&mut self.run_keyframes);
         let (Some(run), Some(folder)) = (self.run.take(), self.settings.runs.clone()) else {
             return;
         };
-        if let Some(before) = self.writer.take() {
-            let _ = before.join();
+        self.writers.retain(|writer| !writer.is_finished());
+        // One at a time is adjusted: runs that come faster than that are written as they were answered.
+        if keyframes > MOST_ADJUSTED || !self.writers.is_empty() {
+            slam = slam.without_last_adjustment();
         }
         let (keep, metrics) = (self.settings.keep_runs, Arc::clone(metrics));
-        self.writer = Some(std::thread::spawn(move || {
+        self.writers.push(std::thread::spawn(move || {
             let written = run.finish(&slam.finish());
             match written.and_then(|some| Ring::prune(&folder, keep).map(|()| some)) {
                 Ok(some) => metrics.run_written(some),
