@@ -31,6 +31,11 @@ mod text;
 mod write_folder;
 mod write_katwijk;
 
+/// Files of the Katwijk archive that belong to no frame.
+pub mod katwijk {
+    pub use crate::formats::katwijk::{PanTilt, read_ptu, read_rocks};
+}
+
 pub use calibration::load_rig;
 pub use correction::{Corrected, Correction};
 pub use error::DataError;

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use barchan_geometry::{StampedPose, Trajectory};
+use barchan_geometry::{Se3, StampedPose, Trajectory};
 use nalgebra::Vector3;
 
 use crate::image_file::write_whole;
@@ -33,13 +33,33 @@ pub(crate) fn write_sensors(dir: &Path, sensors: &Sensors) -> Result<(), DataErr
         [s.time, p.x, p.y, p.z, e.x, e.y, e.z]
     });
     write_table(dir, GNSS, gnss)?;
+    write_imu_pose(dir, &sensors.T_imu_cam)
+}
+
+/// Writes how the IMU is mounted: the pose of the rectified left camera in its frame.
+#[allow(non_snake_case)]
+pub(crate) fn write_imu_pose(dir: &Path, T_imu_cam: &Se3) -> Result<(), DataError> {
     let pose = Trajectory {
         poses: vec![StampedPose {
             time: 0.0,
-            T_world_cam: sensors.T_imu_cam,
+            T_world_cam: *T_imu_cam,
         }],
     };
     write_whole(&dir.join(IMU_POSE), pose.to_tum().as_bytes())
+}
+
+/// Reads how the IMU is mounted, where a file tells.
+pub(crate) fn read_imu_pose(dir: &Path) -> Result<Option<Se3>, DataError> {
+    let file = dir.join(IMU_POSE);
+    if !file.is_file() {
+        return Ok(None);
+    }
+    let poses = Trajectory::read_tum(&file)?.poses;
+    let [pose] = poses.as_slice() else {
+        let message = format!("{} lines; one pose is expected", poses.len());
+        return Err(DataError::file(&file, message));
+    };
+    Ok(Some(pose.T_world_cam))
 }
 
 fn write_table<const N: usize>(
@@ -58,6 +78,7 @@ fn write_table<const N: usize>(
 }
 
 /// Reads the streams that are there; `None` where there is none.
+#[allow(non_snake_case)]
 pub(crate) fn read_sensors(dir: &Path) -> Result<Option<Sensors>, DataError> {
     let imu = read_table(dir, IMU)?.into_iter().map(|r| ImuSample {
         time: r[0],
@@ -81,17 +102,11 @@ pub(crate) fn read_sensors(dir: &Path) -> Result<Option<Sensors>, DataError> {
         gnss: gnss.collect(),
         ..Sensors::default()
     };
-    let pose_file = dir.join(IMU_POSE);
-    if pose_file.is_file() {
-        let poses = Trajectory::read_tum(&pose_file)?.poses;
-        let [pose] = poses.as_slice() else {
-            let message = format!("{} lines; one pose is expected", poses.len());
-            return Err(DataError::file(&pose_file, message));
-        };
-        sensors.T_imu_cam = pose.T_world_cam;
+    if let Some(T_imu_cam) = read_imu_pose(dir)? {
+        sensors.T_imu_cam = T_imu_cam;
     } else if !sensors.imu.is_empty() {
         return Err(DataError::file(
-            &pose_file,
+            &dir.join(IMU_POSE),
             "missing: imu.csv needs the pose of the left camera in the IMU's frame, as one TUM line",
         ));
     }

@@ -2,11 +2,13 @@ use std::path::Path;
 
 use barchan_geometry::Rig;
 use chrono::{DateTime, Datelike, Timelike};
+use nalgebra::Point3;
 
 use crate::formats::katwijk::{ZONE, to_utm31};
 use crate::image_file::write_whole;
+use crate::sensor_files::write_imu_pose;
 use crate::write_folder::{write_beside, write_rgb};
-use crate::{DataError, StereoSource, Synth};
+use crate::{DataError, OdometrySample, StereoSource, Synth};
 
 /// Noon of a day of the campaign, milliseconds since 1970.
 const START: f64 = 1_448_539_200_000.0;
@@ -16,8 +18,9 @@ const BEACH: (f64, f64) = (52.2173, 4.4035);
 const RADIUS: f64 = 0.125;
 const TRACK: f64 = 0.8;
 
-/// Writes a rendered traverse in the layout of format `katwijk`: `LocCam/`, `rig.toml`,
-/// `gps-latlong.txt`, `gps-utm31.txt`, `imu.txt` and `odometry.txt`, with x east and y north. Image
+/// Writes a rendered traverse in the layout of format `katwijk`: `LocCam/`, `gps-latlong.txt`, `gps-utm31.txt`,
+/// `imu.txt`, `odometry.txt`, `ptu.txt` and `rocks.txt`, with x east and y north; and `rig.toml` and `imu.tum`, for
+/// camera and IMU are not those of the archive. Image
 /// stamps are `ahead` seconds early: an image shows a place that the fixes reach so much later, the
 /// fault that de Jong 2020 found in the archive (section 9.1).
 ///
@@ -96,7 +99,15 @@ fn write_files(
         odometry += &" 0".repeat(4 * 3 + 3);
         odometry += "\n";
     }
+    write_imu_pose(dir, &sensors.T_imu_cam)?;
+    let still = |s: &OdometrySample| Ok(format!("{} 0 0\n", stamp(dir, s.time)?));
+    let ptu = sensors.odometry.iter().map(still);
+    let ptu = ptu.collect::<Result<String, DataError>>()?;
+    let rock = |c: &Point3<f64>| format!("{:.6} {:.6}\n", east + c.x, north + c.y);
+    let rocks = synth.rocks().iter().map(|r| rock(&r.centre)).collect();
     for (name, text) in [
+        ("ptu.txt", ptu),
+        ("rocks.txt", rocks),
         ("gps-latlong.txt", degrees),
         ("gps-utm31.txt", metres),
         ("imu.txt", imu),
@@ -154,6 +165,20 @@ mod tests {
         for (a, b) in found.gnss.iter().zip(&made.gnss) {
             assert!((a.p_world - (b.p_world - origin)).norm() < 1e-3);
             assert_eq!(a.sigma, b.sigma);
+        }
+        let left_over = found.T_imu_cam.inverse() * made.T_imu_cam;
+        assert!(left_over.translation.vector.norm() < 1e-8 && left_over.rotation.angle() < 1e-8);
+        let ptu = crate::katwijk::read_ptu(&dir.join("ptu.txt")).unwrap();
+        assert_eq!(ptu.len(), made.odometry.len());
+        let rocks = crate::katwijk::read_rocks(&dir.join("rocks.txt")).unwrap();
+        let (east, north) = to_utm31(BEACH.0, BEACH.1).unwrap();
+        assert!(!rocks.is_empty() && rocks.len() == synth.rocks().len());
+        for (read, rock) in rocks.iter().zip(synth.rocks()) {
+            let off = [
+                read[0] - east - rock.centre.x,
+                read[1] - north - rock.centre.y,
+            ];
+            assert!(off[0].hypot(off[1]) < 1e-5);
         }
         assert_eq!(found.odometry.len(), made.odometry.len());
         // The radius is what the fixes make of it, but one for all.

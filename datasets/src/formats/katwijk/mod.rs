@@ -2,15 +2,17 @@ mod tables;
 
 use std::path::{Path, PathBuf};
 
-use barchan_geometry::nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use barchan_geometry::nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use barchan_geometry::{Camera, Distortion, Rig, Se3, StampedPose, Trajectory};
 
 use super::{Format, not_here};
 use crate::calibration::{find_calibration, load_rig};
 use crate::listing::{Named, list};
 use crate::pairs::{Calibrated, Pair, PairSource};
+use crate::sensor_files::read_imu_pose;
 use crate::{DataError, GnssFix, ImuSample, OdometrySample, Sensors};
 use tables::{Fix, WHEELS, Wheels, read_fixes, read_imu, read_wheels, stamp};
+pub use tables::{PanTilt, read_ptu, read_rocks};
 pub(crate) use tables::{ZONE, to_utm31};
 
 /// Katwijk beach (ESA 2015): a part of a traverse with the images of the localisation camera in
@@ -26,9 +28,10 @@ pub(crate) use tables::{ZONE, to_utm31};
 /// apart. Frames outside it are left out as in format `euroc`: where it covers less than half
 /// of the frames they all stay, without truth. It is the antenna that is tracked, not the camera.
 ///
-/// `imu.txt`, `odometry.txt` and the fixes give [`Sensors`]. The archive tells neither how the IMU is
-/// mounted nor the size of the wheels: the IMU is taken to lie with x ahead, y left and z up in the
-/// left camera, and speed needs the fixes (see [`odometry`]).
+/// `imu.txt`, `odometry.txt` and the fixes give [`Sensors`]. The IMU is mounted as [`T_imu_loc_cam`] says, or as
+/// an `imu.tum` as of format `folder` beside the text files does. The archive does not tell the size of the
+/// wheels: speed needs the fixes (see [`odometry`]). `ptu.txt` and the positions of rocks are read by
+/// [`read_ptu`](crate::katwijk::read_ptu) and [`read_rocks`](crate::katwijk::read_rocks).
 pub(super) const FORMAT: Format = Format {
     name: "katwijk",
     layout: "LocCam/ with LocCam_YYYY_MM_DD_hh_mm_ss_mmm_0.png (left) and _1.png (right)",
@@ -37,7 +40,8 @@ pub(super) const FORMAT: Format = Format {
 };
 
 /// The same with the camera pair on the mast. Its principal points and distortion are not among the
-/// published figures: without a calibration in `PanCam/`, the middle of the image and none are taken.
+/// published figures: without a calibration in `PanCam/`, the middle of the image and none are taken. The mast
+/// turns, so the IMU, which does not, says nothing of these cameras and is left out.
 pub(super) const PAN_CAM: Format = Format {
     name: "katwijk-pancam",
     layout: "PanCam/ with PanCam_YYYY_MM_DD_hh_mm_ss_mmm_0.png (left) and _1.png (right)",
@@ -128,11 +132,16 @@ fn open(dir: &Path, camera: &str, format: &Format, built_in: Rig) -> Result<Pair
         .map_or(Ok(Vec::new()), |f| read_fixes(f))?;
     let truth = planar_truth(&fixes, &mut images);
     let table = |name: &str| Some(dir.join(name)).filter(|f| f.is_file());
-    let imu = table("imu.txt").map_or(Ok(Vec::new()), |f| read_imu(&f))?;
+    let mut imu = table("imu.txt").map_or(Ok(Vec::new()), |f| read_imu(&f))?;
     let wheels = table("odometry.txt").map_or(Ok(Vec::new()), |f| read_wheels(&f))?;
+    let odometry = odometry(&wheels, &fixes, &imu);
+    if camera != "LocCam" {
+        imu.clear();
+    }
+    let mounted = || T_imu_loc_cam() * calibrated.R_rect_left().inverse();
     let sensors = Sensors {
-        T_imu_cam: axes_ahead() * calibrated.R_rect_left().inverse(),
-        odometry: odometry(&wheels, &fixes, &imu),
+        T_imu_cam: read_imu_pose(dir)?.unwrap_or_else(mounted),
+        odometry,
         gnss: local(&fixes),
         imu,
     };
@@ -185,11 +194,12 @@ fn pair_by_time(folder: &Path, files: Vec<Named>, camera: &str) -> Result<Vec<Ti
     Ok(pairs)
 }
 
-/// From the left camera to axes x ahead, y left, z up at its place.
-fn axes_ahead() -> Se3 {
-    let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-    Se3::from_parts(Vector3::zeros().into(), rotation)
+/// From the left localisation camera to the IMU, by the frames published with the archive: the IMU has x
+/// backwards, y to the right and z up, and the camera looks along its -x, 18 degrees down.
+#[allow(non_snake_case)]
+fn T_imu_loc_cam() -> Se3 {
+    let rotation = UnitQuaternion::new_normalize(Quaternion::new(-0.416, 0.572, 0.572, -0.416));
+    Se3::from_parts(Vector3::new(-0.382, -0.078, 0.557).into(), rotation)
 }
 
 /// Fixes from the first of them on.

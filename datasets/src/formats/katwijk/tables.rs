@@ -160,6 +160,60 @@ pub(super) fn read_wheels(path: &Path) -> Result<Vec<Wheels>, DataError> {
     })
 }
 
+/// Where the mast of the cameras pointed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PanTilt {
+    /// Seconds since 1970.
+    pub time: f64,
+    /// Radians.
+    pub pan: f64,
+    /// Radians.
+    pub tilt: f64,
+}
+
+/// `ptu.txt` of the Katwijk archive: time, pan and tilt, in the order of time.
+///
+/// # Errors
+/// When the file cannot be read, or a line is not of a time and two numbers.
+pub fn read_ptu(path: &Path) -> Result<Vec<PanTilt>, DataError> {
+    rows(path, 3, |line, time, cells| {
+        let [pan, tilt] = numbers(path, line, cells)?;
+        Ok((time, PanTilt { time, pan, tilt }))
+    })
+}
+
+/// A file of rock positions of the Katwijk archive, such as `large-rocks-traverse12.txt`: east and north of each
+/// in UTM zone 31 north, metres. As of fixes, the range of the numbers tells what they are.
+///
+/// # Errors
+/// When the file cannot be read, or a line is not of two coordinates near the zone.
+pub fn read_rocks(path: &Path) -> Result<Vec<[f64; 2]>, DataError> {
+    let text = std::fs::read_to_string(path).map_err(DataError::io(path))?;
+    let mut rocks = Vec::new();
+    for (line, row) in text.lines().enumerate() {
+        let cells: Vec<&str> = row.split_whitespace().collect();
+        if cells.is_empty() {
+            continue;
+        }
+        let place = match cells.len() {
+            2 => {
+                let [a, b] = numbers(path, line, &cells)?;
+                to_utm31(a, b)
+            }
+            _ => None,
+        };
+        let (east, north) = place.ok_or_else(|| {
+            let message = format!(
+                "line {}: expected two numbers, east and north in zone 31 or latitude and longitude; remove the line",
+                line + 1
+            );
+            DataError::file(path, message)
+        })?;
+        rocks.push([east, north]);
+    }
+    Ok(rocks)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -207,5 +261,37 @@ mod tests {
         ] {
             assert_eq!(to_utm31(a, b), None);
         }
+    }
+
+    #[test]
+    fn the_mast_and_the_rocks_are_read_and_faults_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = |name: &str, text: &str| {
+            let path = dir.path().join(name);
+            std::fs::write(&path, text).unwrap();
+            path
+        };
+        let ptu = file(
+            "ptu.txt",
+            "2015_11_26_12_00_01_1000 0.5 -0.1\n\n2015_11_26_12_00_00_000\t0 0.25\n",
+        );
+        let read = read_ptu(&ptu).unwrap();
+        assert_eq!(read.len(), 2);
+        assert_eq!(read[1].time - read[0].time, 2.0);
+        assert_eq!([read[1].pan, read[1].tilt, read[0].tilt], [0.5, -0.1, 0.25]);
+
+        let (east, north) = to_utm31(52.2173, 4.4035).unwrap();
+        let rocks = file("rocks.txt", &format!("{east} {north}\n52.2173 4.4035\n"));
+        let read = read_rocks(&rocks).unwrap();
+        assert_eq!(read.len(), 2);
+        assert_eq!(read[0], [east, north]);
+        assert!((read[1][0] - east).hypot(read[1][1] - north) < 1e-6);
+        for wrong in ["1 2 3\n", "5 x\n", "500 600\n", "nan nan\n"] {
+            let message = read_rocks(&file("wrong.txt", wrong))
+                .unwrap_err()
+                .to_string();
+            assert!(message.contains("line 1"), "{wrong}: {message}");
+        }
+        assert!(read_ptu(&file("wrong.txt", "2015_11_26_12_00_00_000 1\n")).is_err());
     }
 }

@@ -87,6 +87,14 @@ fn pairs_truth_and_sensors_are_read() {
         (50, 5, 41)
     );
     assert_eq!(sensors.imu[3].rate, Vector3::new(0.01, 0.02, 0.2));
+    // The camera looks against the x of the IMU, 18 degrees down, and its right is the IMU's y.
+    let axis = |v: Vector3<f64>| sensors.T_imu_cam.rotation * v;
+    let down = axis(Vector3::z()).z.asin().to_degrees();
+    assert!(
+        axis(Vector3::z()).x < -0.9 && (down + 18.0).abs() < 2.0,
+        "{down}"
+    );
+    assert!(axis(Vector3::x()).y > 0.99);
     // The file has the deviation to the north first.
     assert_eq!(sensors.gnss[0].sigma, Vector3::new(0.004, 0.005, 0.009));
     for sample in &sensors.odometry {
