@@ -147,18 +147,25 @@ fn a_demo_on_ones_own_images_ends_in_a_page() {
     let dir = tempfile::tempdir().unwrap();
     let data = rendered(dir.path(), 8);
     let out = dir.path().join("demo");
-    let said = barchan()
-        .args(["demo", "--data", text(&data), "--out", text(&out)])
-        .assert()
-        .success();
-    let said = String::from_utf8_lossy(&said.get_output().stdout).into_owned();
+    let demo = ["demo", "--data", text(&data), "--out", text(&out)];
+    let said = |args: &[&str], commands: &[&str]| {
+        let output = barchan().args(args).assert().success();
+        let said = String::from_utf8_lossy(&output.get_output().stdout).into_owned();
+        for command in commands {
+            let command = format!("barchan {command}");
+            assert!(said.contains(&command), "{command}: {said}");
+        }
+        said
+    };
     // Every step is a command that can be typed, and the images are offered to the network.
-    for command in ["slam --data", "map", "report", "train --finetune"] {
-        assert!(
-            said.contains(&format!("barchan {command}")),
-            "{command}: {said}"
-        );
-    }
+    let steps = ["data check", "slam --data", "map", "report"];
+    let offer = said(&demo, &steps);
+    assert!(offer.contains("--finetune --out"), "{offer}");
+    said(
+        &[&demo[..], &["--finetune"]].concat(),
+        &[&["train --finetune"], &steps[..]].concat(),
+    );
+    exists(&out, &["train/weights.safetensors"]);
     exists(
         &out,
         &["slam/trajectory.tum", "map/cloud.ply", "report.html"],
