@@ -14,4 +14,5 @@ mod program;
 mod serve;
 mod settings;
 mod smoke;
+mod structured_light;
 mod survival;
