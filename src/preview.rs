@@ -253,7 +253,7 @@ fn byte(pixel: &image::Rgb<f32>) -> image::Rgb<u8> {
 }
 
 /// From blue at 0 to red at 1.
-fn turbo(share: f32) -> image::Rgb<u8> {
+pub fn turbo(share: f32) -> image::Rgb<u8> {
     let colour = colorous::TURBO.eval_continuous(f64::from(share.clamp(0.0, 1.0)));
     image::Rgb([colour.r, colour.g, colour.b])
 }

@@ -92,6 +92,52 @@ impl KdTree {
     }
 }
 
+impl KdTree {
+    /// The nearest point: the square of its distance, and its index; `None` of no points, or where `p` is not finite.
+    /// [`KdTree::nearest`] with a count of 1, without lists.
+    pub fn nearest_one(&self, p: &Point3<f64>) -> Option<(f64, usize)> {
+        if !p.iter().all(|x| x.is_finite()) {
+            return None;
+        }
+        let mut found: Option<(f64, usize)> = None;
+        let farthest = |found: &Option<(f64, usize)>| found.map_or(f64::INFINITY, |f| f.0);
+        let take = |found: &mut Option<(f64, usize)>, (q, index): &(Point3<f64>, usize)| {
+            let distance = (q - p).norm_squared();
+            if distance < farthest(found) {
+                *found = Some((distance, *index));
+            }
+        };
+        // Slices still to be searched: each step halves one, so no more wait than an address has bits.
+        let mut slices = [(0, 0, 0.0); usize::BITS as usize];
+        slices[0] = (0, self.points.len(), 0.0);
+        let mut waiting = 1;
+        while waiting > 0 {
+            waiting -= 1;
+            let (mut start, mut end, least) = slices[waiting];
+            if least >= farthest(&found) {
+                continue;
+            }
+            // Down to the leaf on the side of `p`; the other sides wait.
+            while end - start > LEAF {
+                let middle = start + (end - start) / 2;
+                let axis = usize::from(self.axes[middle]);
+                let across = p[axis] - self.points[middle].0[axis];
+                take(&mut found, &self.points[middle]);
+                let far = match across < 0.0 {
+                    true => (middle + 1, std::mem::replace(&mut end, middle)),
+                    false => (std::mem::replace(&mut start, middle + 1), middle),
+                };
+                slices[waiting] = (far.0, far.1, across * across);
+                waiting += 1;
+            }
+            self.points[start..end]
+                .iter()
+                .for_each(|q| take(&mut found, q));
+        }
+        found
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,9 +167,19 @@ mod tests {
                 for (distance, index) in found {
                     assert_eq!((points[index] - p).norm_squared(), distance);
                 }
+                let one = tree.nearest_one(&p).unwrap();
+                assert_eq!(
+                    (one.0, (points[one.1] - p).norm_squared()),
+                    (all[0], all[0])
+                );
             }
         }
         assert!(tree.nearest(&Point3::new(f64::NAN, 0.0, 0.0), 3).is_empty());
+        assert_eq!(
+            tree.nearest_one(&Point3::new(0.0, f64::INFINITY, 0.0)),
+            None
+        );
+        assert_eq!(KdTree::new(&[]).nearest_one(&points[0]), None);
         assert_eq!(KdTree::new(&points[..2]).nearest(&points[0], 5).len(), 2);
         assert!(KdTree::new(&[]).nearest(&points[0], 5).is_empty());
     }

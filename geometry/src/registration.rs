@@ -5,6 +5,8 @@
 //! distance alone proves no alignment: the motion found stands beside it, and how much the shape of the
 //! ground has to say.
 
+use std::sync::OnceLock;
+
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Point3, SymmetricEigen, Vector3, Vector6};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -136,25 +138,23 @@ impl Reference {
 
     /// Index of the nearest point, and its distance; not a number for a point that is none.
     fn nearest(&self, p: &Point3<f64>) -> (usize, f64) {
-        let found = self.tree.nearest(p, 1);
-        found.first().map_or((0, f64::NAN), |f| (f.1, f.0.sqrt()))
+        let found = self.tree.nearest_one(p);
+        found.map_or((0, f64::NAN), |f| (f.1, f.0.sqrt()))
     }
 
-    /// The unit normal at every point: across the plane through its neighbours.
-    fn normals(&self, neighbours: usize) -> Vec<Vector3<f64>> {
-        let normal = |p: &Point3<f64>| {
-            let near = self.tree.nearest(p, neighbours.max(3));
-            let n = near.len() as f64;
-            // From the point itself: coordinates may be large.
-            let offsets = || near.iter().map(|f| self.points[f.1] - p);
-            let mean = offsets().sum::<Vector3<f64>>() / n;
-            let spread = offsets().fold(Matrix3::zeros(), |sum, o| {
-                sum + (o - mean) * (o - mean).transpose()
-            });
-            let eigen = SymmetricEigen::new(spread);
-            eigen.eigenvectors.column(eigen.eigenvalues.imin()).into()
-        };
-        self.points.par_iter().map(normal).collect()
+    /// The unit normal at a point: across the plane through its neighbours.
+    fn normal(&self, index: usize, neighbours: usize) -> Vector3<f64> {
+        let p = &self.points[index];
+        let near = self.tree.nearest(p, neighbours.max(3));
+        let n = near.len() as f64;
+        // From the point itself: coordinates may be large.
+        let offsets = || near.iter().map(|f| self.points[f.1] - p);
+        let mean = offsets().sum::<Vector3<f64>>() / n;
+        let spread = offsets().fold(Matrix3::zeros(), |sum, o| {
+            sum + (o - mean) * (o - mean).transpose()
+        });
+        let eigen = SymmetricEigen::new(spread);
+        eigen.eigenvectors.column(eigen.eigenvalues.imin()).into()
     }
 }
 
@@ -171,10 +171,17 @@ pub fn register(
     config: &IcpConfig,
 ) -> Result<Registration, RegistrationError> {
     let estimate = finite(estimate);
-    let normals = reference.normals(config.neighbours);
-    let own_normals = match config.method {
+    // Planes only where points correspond: of a large reference that may be little.
+    let normals: Vec<OnceLock<Vector3<f64>>> = vec![OnceLock::new(); reference.len()];
+    let normal_at =
+        |index: usize| *normals[index].get_or_init(|| reference.normal(index, config.neighbours));
+    let own_normals: Vec<Vector3<f64>> = match config.method {
         IcpMethod::PointToPlane => vec![],
-        IcpMethod::Generalised => Reference::new(&estimate)?.normals(config.neighbours),
+        IcpMethod::Generalised => {
+            let own = Reference::new(&estimate)?;
+            let indices = (0..own.len()).into_par_iter();
+            indices.map(|k| own.normal(k, config.neighbours)).collect()
+        }
     };
     let mut T_ref_est = *initial;
     let (mut iterations, mut converged) = (0, false);
@@ -188,25 +195,33 @@ pub fn register(
             if distance.is_nan() || distance > config.max_distance {
                 return None;
             }
-            let (q, normal) = (reference.points[index], normals[index]);
-            // What the error counts in each direction.
-            let weight = match config.method {
-                IcpMethod::PointToPlane => normal * normal.transpose(),
+            let normal = normal_at(index);
+            let error = p - reference.points[index];
+            // A small motion (v, w) about the reference's origin moves p by v + w x p.
+            let (a, b) = match config.method {
+                IcpMethod::PointToPlane => {
+                    let across = p.coords.cross(&normal);
+                    let row = Vector6::from_fn(|i, _| match i {
+                        0..3 => normal[i],
+                        _ => across[i - 3],
+                    });
+                    (row * row.transpose(), row * normal.dot(&error))
+                }
                 IcpMethod::Generalised => {
+                    let mut j = Matrix3x6::zeros();
+                    j.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+                    j.fixed_view_mut::<3, 3>(0, 3)
+                        .copy_from(&-p.coords.cross_matrix());
+                    // What the error counts in each direction.
                     let own = rotation * own_normals[k];
-                    (plane(&normal) + plane(&own)).try_inverse()?
+                    let weight = (plane(&normal) + plane(&own)).try_inverse()?;
+                    let weighted = j.transpose() * weight;
+                    (weighted * j, weighted * error)
                 }
             };
-            let error = p - q;
-            // A small motion (v, w) about the reference's origin moves p by v + w x p.
-            let mut j = Matrix3x6::zeros();
-            j.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-            j.fixed_view_mut::<3, 3>(0, 3)
-                .copy_from(&-p.coords.cross_matrix());
-            let weighted = j.transpose() * weight;
             Some(Equations {
-                a: weighted * j,
-                b: weighted * error,
+                a,
+                b,
                 squares: error.norm_squared(),
                 count: 1,
             })

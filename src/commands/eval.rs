@@ -1,6 +1,7 @@
 mod matches;
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use barchan_datasets::{disparity_file, open, read_planar};
@@ -12,11 +13,12 @@ use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::nalgebra::Point3;
 use barchan_geometry::registration::{IcpConfig, IcpMethod, Reference, Registration, register};
 use barchan_geometry::{Se3, Trajectory};
-use barchan_terrain::{Cloud, Raster};
+use barchan_terrain::{Cloud, CloudPoint, Raster};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
 
 use crate::output::Output;
+use crate::preview::turbo;
 
 /// Compare with the truth
 #[derive(Parser)]
@@ -72,6 +74,10 @@ enum What {
         /// Matches planes with planes (generalised ICP) instead of points with planes
         #[arg(long)]
         generalised: bool,
+        /// Writes the registered estimate as a PLY, coloured by distance to the truth: from blue to red at
+        /// --max-distance and beyond (Hong 2021, figure 10)
+        #[arg(long, value_name = "FILE")]
+        error_cloud: Option<PathBuf>,
     },
     /// Elevations against true ones in the same frame, cell by cell; of `elevation.tif` also whether
     /// its bounds hold
@@ -98,6 +104,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
             reference,
             max_distance,
             generalised,
+            error_cloud,
         } => {
             let config = IcpConfig {
                 max_distance,
@@ -107,7 +114,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
                 },
                 ..IcpConfig::default()
             };
-            cloud(&est, &reference, &config, output)
+            cloud(&est, &reference, &config, error_cloud.as_deref(), output)
         }
         What::Dem {
             est,
@@ -170,6 +177,8 @@ fn disparity(pred: &Path, gt: &str, output: &Output) -> Result<()> {
 struct CloudFigures {
     as_it_lies: CloudScore,
     registration: Registration,
+    /// Seconds that registration took, planes of the reference and all, the reading of files not counted.
+    seconds: f64,
     /// Rows of the 4 x 4 matrix that maps the estimate to the reference.
     transform: [[f64; 4]; 4],
     registered: CloudScore,
@@ -178,20 +187,37 @@ struct CloudFigures {
 /// Points that registration uses at most: more change nothing but the time.
 const REGISTERED_POINTS: usize = 100_000;
 
-fn cloud(est: &Path, reference: &Path, config: &IcpConfig, output: &Output) -> Result<()> {
+fn cloud(
+    est: &Path,
+    reference: &Path,
+    config: &IcpConfig,
+    error_cloud: Option<&Path>,
+    output: &Output,
+) -> Result<()> {
     let context = || format!("{} against {}", est.display(), reference.display());
     let estimate = read_points(est)?;
-    let truth = Reference::new(&read_points(reference)?)
-        .with_context(|| reference.display().to_string())?;
-    let as_it_lies = score_cloud(&estimate, &truth, config.max_distance).with_context(context)?;
+    let truth = read_points(reference)?;
+    let begun = Instant::now();
+    let truth = Reference::new(&truth).with_context(|| reference.display().to_string())?;
     let step = estimate.len().div_ceil(REGISTERED_POINTS).max(1);
     let sample: Vec<_> = estimate.iter().copied().step_by(step).collect();
     let registration = register(&sample, &truth, &Se3::identity(), config).with_context(context)?;
+    let seconds = begun.elapsed().as_secs_f64();
+    let as_it_lies = score_cloud(&estimate, &truth, config.max_distance).with_context(context)?;
     let moved: Vec<_> = estimate
         .iter()
         .map(|p| registration.T_ref_est * p)
         .collect();
     let registered = score_cloud(&moved, &truth, config.max_distance).with_context(context)?;
+    if let Some(path) = error_cloud {
+        let coloured = |p: &Point3<f64>| CloudPoint {
+            position: *p,
+            colour: turbo((truth.distance(p) / config.max_distance) as f32).0,
+            sigma: f32::NAN,
+        };
+        let points = moved.iter().map(coloured).collect();
+        Cloud { points }.write_ply(path)?;
+    }
     let matrix = registration.T_ref_est.to_homogeneous();
     let transform = std::array::from_fn(|r| std::array::from_fn(|c| matrix[(r, c)]));
 
@@ -224,6 +250,7 @@ fn cloud(est: &Path, reference: &Path, config: &IcpConfig, output: &Output) -> R
     let figures = CloudFigures {
         as_it_lies,
         registration,
+        seconds,
         transform,
         registered,
     };
@@ -231,7 +258,7 @@ fn cloud(est: &Path, reference: &Path, config: &IcpConfig, output: &Output) -> R
 }
 
 /// The points of a cloud, or the centres of the known cells of a raster.
-fn read_points(path: &Path) -> Result<Vec<Point3<f64>>> {
+pub fn read_points(path: &Path) -> Result<Vec<Point3<f64>>> {
     let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
     if extension != "tif" && extension != "tiff" {
         let points = Cloud::read(path)?.points;

@@ -2,16 +2,17 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
+use barchan_geometry::registration::{IcpConfig, Reference, Registration, register};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
-    CellStatistic, DenseKeyframe, Levelling, MapConfig, NoiseModel, StereoErrors, VoxelScene,
-    colour_gains, elevation_of_keyframes,
+    CellStatistic, DenseKeyframe, Levelling, MapConfig, NoiseModel, StereoErrors, TerrainMap,
+    VoxelScene, colour_gains, elevation_of_keyframes,
 };
 use clap::{Parser, ValueEnum};
 use serde::Serialize;
 
-use crate::commands::eval::read_trajectory;
+use crate::commands::eval::{read_points, read_trajectory};
 use crate::output::{Output, StagedDir};
 use crate::slam_run::{RunKeyframe, SlamRun};
 
@@ -40,6 +41,13 @@ pub struct Args {
     /// Farthest accepted depth, metres [default: where depth is known to 10 %]
     #[arg(long, value_name = "M")]
     max_depth: Option<f64>,
+    /// Largest deviation of depth over depth of a point of the cloud and of the DEM
+    #[arg(long, default_value_t = MapConfig::default().max_relative_sigma, value_name = "SHARE")]
+    max_relative_sigma: f64,
+    /// Every point counts alike and stays, however unsure, as in Hong 2021 [default: points count by the inverse of
+    /// their variance, and voxels go where others are twice as sure of the place]
+    #[arg(long)]
+    every_point: bool,
     /// How the points of a cell make the height of the DEM
     #[arg(long, value_enum, default_value_t = Statistic::Mean)]
     statistic: Statistic,
@@ -64,6 +72,10 @@ pub struct Args {
     /// best: TUM text, KITTI text, gt.csv, or gnss.csv (the antenna is taken for the camera)
     #[arg(long, value_name = "FILE", conflicts_with = "poses")]
     align: Option<PathBuf>,
+    /// Registers the map to a survey of the same ground, points with planes, from where it lies or --align took it:
+    /// .ply, .las, .laz or the GeoTIFF of a DEM. Products are then in the survey's frame
+    #[arg(long, value_name = "FILE", conflicts_with = "poses")]
+    register: Option<PathBuf>,
     /// Writes cloud.pcd as well
     #[arg(long)]
     pcd: bool,
@@ -141,6 +153,8 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         voxel: args.voxel,
         cell: args.cell,
         min_points: args.min_points,
+        max_relative_sigma: args.max_relative_sigma,
+        surest: !args.every_point,
         statistic: args.statistic.into(),
         ..MapConfig::default()
     };
@@ -198,7 +212,14 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         true => scene.clear_ghosts(frames(&[]), &slam.rig, &config.limits)?,
         false => 0,
     };
+    let mut registered = None;
+    if let Some(file) = &args.register {
+        let (motion, notice) = registration(&scene.clone().into_terrain(&config)?, file)?;
+        config.levelling = Levelling::Known(motion);
+        registered = Some(notice);
+    }
     let mut map = scene.into_terrain(&config)?;
+    map.notices.extend(registered);
     let elevation = elevation_of_keyframes(
         frames(&gains),
         &slam.rig,
@@ -283,6 +304,41 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         args.out.display(),
     );
     output.result(&summary, &text)
+}
+
+/// The motion that takes the run's world onto a survey of the same ground, and what is to be said of it.
+fn registration(map: &TerrainMap, survey: &Path) -> Result<(Se3, String)> {
+    /// Farther from the survey than this a point does not correspond, metres: what `--align` may leave.
+    const REACH: f64 = 2.0;
+    /// Points of the map that are used: more change nothing but the time.
+    const POINTS: usize = 50_000;
+    let points = map.cloud().points;
+    let step = points.len().div_ceil(POINTS).max(1);
+    let sample: Vec<_> = points.iter().step_by(step).map(|p| p.position).collect();
+    let reference =
+        Reference::new(&read_points(survey)?).with_context(|| survey.display().to_string())?;
+    // First from afar, then with what is near alone.
+    let mut found: Option<Registration> = None;
+    for max_distance in [REACH, 0.25 * REACH] {
+        let start = found.map_or(Se3::identity(), |f| f.T_ref_est);
+        let config = IcpConfig {
+            max_distance,
+            ..IcpConfig::default()
+        };
+        let next = register(&sample, &reference, &start, &config);
+        found = Some(next.with_context(|| survey.display().to_string())?);
+    }
+    let found = found.context("two passes are made")?;
+    let text = format!(
+        "registered to {}: moved by {:.3} m and {:.3} degrees, {:.0} % of its points lie within {} m of the survey, RMSE {:.3} m",
+        survey.display(),
+        found.translation,
+        found.rotation_deg,
+        100.0 * found.overlap,
+        0.25 * REACH,
+        found.rmse
+    );
+    Ok((found.T_ref_est * map.T_level_world, text))
 }
 
 /// Least and greatest of all gains; none of none.

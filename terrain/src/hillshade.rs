@@ -27,8 +27,8 @@ impl Default for Light {
 /// Shaded relief as `gdaldem hillshade` makes it: Horn's gradient, Lambert's cosine, 1 (dark) to 255.
 /// 0 is no data: at the border, and wherever one of the nine elevations is unknown.
 ///
-/// gdaldem divides by an approximate square root whose last digits depend on the processor; this
-/// divides exactly. Only a pixel within 1e-4 of the half between two shades may round otherwise.
+/// gdaldem takes an approximate square root whose last digits depend on the processor, and this takes the same: a pixel
+/// within 1e-4 of the half between two shades may round otherwise on another machine.
 pub fn hillshade(dem: &Raster<f32>, light: &Light) -> Raster<u8> {
     let (w, h) = (dem.grid.width, dem.grid.height);
     let mut values = vec![0; w * h];
@@ -67,13 +67,32 @@ fn shade(dem: &Raster<f32>, column: usize, row: usize, light: &Light) -> f64 {
     // Cosine between the surface normal and the light.
     let (azimuth, altitude) = (light.azimuth.to_radians(), light.altitude.to_radians());
     let from_light = y * azimuth.cos() - x * azimuth.sin();
-    let cosine = (altitude.sin() - altitude.cos() * from_light) / (1.0 + x * x + y * y).sqrt();
+    let cosine = over_root(
+        altitude.sin() - altitude.cos() * from_light,
+        1.0 + x * x + y * y,
+    );
     // Not f64::max, which would turn an unknown elevation into a shadow.
     if cosine < 0.0 {
         1.0
     } else {
         1.0 + 254.0 * cosine
     }
+}
+
+/// `a` over the root of `b`, as gdaldem has it: the processor's guess of twelve bits and a step of Newton's. With the true
+/// root one of 248 004 shades of the mars yard of 2021 is another.
+#[cfg(target_arch = "x86_64")]
+fn over_root(a: f64, b: f64) -> f64 {
+    use std::arch::x86_64::{_mm_cvtss_f32, _mm_rsqrt_ss, _mm_set_ss};
+    // SAFETY: SSE is part of every x86-64.
+    let guess = f64::from(unsafe { _mm_cvtss_f32(_mm_rsqrt_ss(_mm_set_ss(b as f32))) });
+    a * (guess * (1.5 - 0.5 * b * (guess * guess)))
+}
+
+/// `a` over the root of `b`; where there is no SSE, gdaldem too divides.
+#[cfg(not(target_arch = "x86_64"))]
+fn over_root(a: f64, b: f64) -> f64 {
+    a / b.sqrt()
 }
 
 #[cfg(test)]

@@ -31,6 +31,7 @@ mod ply;
 mod raster;
 mod rover;
 mod slope;
+mod surest;
 mod voxel;
 
 pub use cloud::{Cloud, CloudPoint, DepthLimits};

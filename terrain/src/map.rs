@@ -8,9 +8,10 @@ use crate::error::positive;
 use crate::ghosts::Sightlines;
 use crate::photometry::{ColourGains, without_gain};
 use crate::raster::dem;
+use crate::surest::superseded;
 use crate::{
-    CellStatistic, Cloud, Dem, DepthLimits, Light, Raster, TerrainError, Voxel, VoxelMap,
-    fit_plane, hillshade, level,
+    CellStatistic, Cloud, CloudPoint, Dem, DepthLimits, Light, Raster, TerrainError, Voxel,
+    VoxelMap, fit_plane, hillshade, level,
 };
 
 /// A key frame whose disparity is known.
@@ -54,10 +55,17 @@ pub struct MapConfig {
     /// Fewest points of a voxel that is kept. Default 2.
     pub min_points: u32,
     /// Edge of a cell of the DEM, metres. Default: twice the voxel where that is given; else five times the
-    /// median distance of neighbouring samples on the ground in the first key frame, so that one look puts
-    /// 25 points into a cell and the elevation map has enough of them; rounded to 1, 2 or 5 times a power of ten (0.02 m for a rover 0.3 m
+    /// distance of neighbouring samples on the ground that three quarters in the first key frame keep, so that one look
+    /// puts 25 points into most cells and the elevation map has enough of them; rounded to 1, 2 or 5 times a power of ten (0.02 m for a rover 0.3 m
     /// high, 0.2 m for one of 0.8 m and for a car).
     pub cell: Option<f64>,
+    /// Largest deviation of depth over depth of a point that goes into a voxel. Default 0.025: on flat ground such a
+    /// point is off by that share of the camera's height, however far away it is. What is less sure hangs
+    /// before and behind the ground. The elevation map weighs for itself and takes what `limits` let in.
+    pub max_relative_sigma: f64,
+    /// Whether points count by how sure they are, and unsure voxels go where a surer one tells of the same
+    /// place. Default true; false is Hong 2021's cloud, in which a point is a point.
+    pub surest: bool,
     /// How the points of a cell make its elevation. Default: their mean.
     pub statistic: CellStatistic,
     /// Which pixels become points.
@@ -76,6 +84,8 @@ impl Default for MapConfig {
             voxel: None,
             min_points: 2,
             cell: None,
+            max_relative_sigma: 0.025,
+            surest: true,
             statistic: CellStatistic::default(),
             limits: DepthLimits::default(),
             levelling: Levelling::default(),
@@ -219,18 +229,22 @@ impl VoxelScene {
         rig: &RectifiedRig,
         config: &MapConfig,
     ) -> Result<Self, E> {
-        for (field, value) in [("voxel", config.voxel), ("cell", config.cell)] {
+        let max_sigma = config.max_relative_sigma;
+        for (field, value) in [
+            ("voxel", config.voxel),
+            ("cell", config.cell),
+            ("max_relative_sigma", Some(max_sigma)),
+        ] {
             value.map_or(Ok(()), |value| positive(field, value))?;
         }
         let mut gathered = None;
         let mut first_pose = None;
-        let (mut count, mut points) = (0, 0);
+        let (mut count, mut points, mut unsure) = (0, 0, 0);
         for keyframe in keyframes {
             let k = keyframe?;
-            let cloud = k.cloud(rig, &config.limits)?;
+            let mut cloud = k.cloud(rig, &config.limits)?;
             first_pose.get_or_insert(k.T_world_cam);
             count += 1;
-            points += cloud.points.len();
             if cloud.points.is_empty() {
                 continue;
             }
@@ -241,6 +255,15 @@ impl VoxelScene {
                     none.insert((VoxelMap::new(sizes[0])?, sizes))
                 }
             };
+            let seen = cloud.points.len();
+            let is_sure = |p: &CloudPoint| f64::from(p.sigma) <= max_sigma * p.position.z;
+            cloud.points.retain(is_sure);
+            points += cloud.points.len();
+            unsure += seen - cloud.points.len();
+            if !config.surest {
+                // What nobody knows of any point makes all alike.
+                cloud.points.iter_mut().for_each(|p| p.sigma = f32::NAN);
+            }
             map.insert(&cloud.transform(&k.T_world_cam));
         }
 
@@ -250,6 +273,14 @@ impl VoxelScene {
             return Err(nothing(count, config).into());
         };
         let mut notices = Vec::new();
+        if unsure > 0 {
+            notices.push(format!(
+                "{unsure} of {} points ({:.0} %) are too far away for depth to be known to {:.0} % and were left out of the cloud",
+                points + unsure,
+                100.0 * unsure as f64 / (points + unsure) as f64,
+                100.0 * max_sigma
+            ));
+        }
         let voxels = map.voxels(config.min_points);
         if voxels.len() < map.len() {
             let dropped = map.len() - voxels.len();
@@ -327,6 +358,16 @@ impl VoxelScene {
         };
         for v in &mut voxels {
             v.mean = levelled * v.mean;
+        }
+        let before = voxels.len();
+        let mut superseded = superseded(&voxels, cell).into_iter();
+        voxels.retain(|_| superseded.next() != Some(true));
+        if voxels.len() < before {
+            let gone = before - voxels.len();
+            notices.push(format!(
+                "{gone} of {before} voxels ({:.0} %) were left out: a nearer look knows their place better",
+                100.0 * gone as f64 / before as f64
+            ));
         }
         let dem = dem(&voxels, cell, config.statistic, config.max_cells)?;
         if dem.outliers > 0 {
@@ -446,7 +487,7 @@ fn sizes(rig: &RectifiedRig, cloud: &Cloud, config: &MapConfig) -> [f64; 2] {
     }
 }
 
-/// Median distance of neighbouring samples on the ground, metres: the root of the area that a pixel covers on the plane
+/// The distance of neighbouring samples on the ground that three quarters keep, metres: the root of the area that a pixel covers on the plane
 /// that fits the points, `z^3 / (fx fy h)` for a plane at the distance `h`.
 fn ground_spacing(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
     let positions: Vec<Point3<f64>> = cloud.points.iter().map(|p| p.position).collect();
@@ -459,8 +500,8 @@ fn ground_spacing(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
             stride as f64 * (p.z.powi(3) / (rig.fx * rig.fy * height)).sqrt()
         })
         .collect();
-    let middle = spacings.len() / 2;
-    *spacings.select_nth_unstable_by(middle, f64::total_cmp).1
+    let upper = spacings.len() * 3 / 4;
+    *spacings.select_nth_unstable_by(upper, f64::total_cmp).1
 }
 
 /// The nearest, as a ratio, of 1, 2 and 5 times a power of ten.
@@ -481,9 +522,10 @@ fn nothing(keyframes: usize, config: &MapConfig) -> TerrainError {
         "there are no key frames".into()
     } else {
         format!(
-            "none of {keyframes} key frames has a pixel that passes the depth limits {:?}\n  \
+            "none of {keyframes} key frames has a pixel that passes the depth limits {:?} and whose depth is known to {:.0} %\n  \
              cure: look at the disparity (barchan infer), or loosen the limits",
-            config.limits
+            config.limits,
+            100.0 * config.max_relative_sigma
         )
     })
 }
@@ -555,6 +597,8 @@ mod tests {
             voxel: Some(0.02),
             cell: Some(0.05),
             min_points: 1,
+            // The small rig of these tests knows little of depth.
+            max_relative_sigma: 0.1,
             ..MapConfig::default()
         }
     }
@@ -854,6 +898,50 @@ mod tests {
         );
         println!("deviation of colour {raw:.3} as seen, {even:.3} without gains");
         assert!(even < 0.02 && raw > 5.0 * even, "{raw} {even}");
+    }
+
+    /// A near and a far look at one place, of which the far one is half a pixel off: it supersedes nothing, and Hong's cloud
+    /// keeps both.
+    #[test]
+    fn the_far_says_nothing_where_the_near_is_known() {
+        let rig = rig();
+        let look = |x: f64, off: f32| {
+            let mut k = keyframe(&rig, pose(x, 0.0, 0.5, 0.6), |_, _| 0.0).unwrap();
+            k.disparity.iter_mut().for_each(|d| *d += off);
+            k.sigma = Some(Plane::from_pixel(160, 120, image::Luma([0.3])));
+            k
+        };
+        let frames = [look(0.0, -0.5), look(0.9, 0.0)];
+        let high = |surest| {
+            let config = MapConfig {
+                surest,
+                levelling: Levelling::World,
+                ..fine()
+            };
+            let map = map_keyframes(all(&frames), &rig, &config).unwrap();
+            // Ground that the second look sees from less than a metre.
+            let near = map.voxels.iter().filter(|v| {
+                (1.35..1.6).contains(&v.mean.x) && v.mean.y.abs() < 0.15 && v.mean.z.abs() > 0.03
+            });
+            near.count()
+        };
+        assert_eq!(high(true), 0);
+        assert!(high(false) > 20, "{}", high(false));
+        // A tight bound leaves the near alone.
+        let config = MapConfig {
+            max_relative_sigma: 0.03,
+            ..fine()
+        };
+        let map = map_keyframes([Ok(look(0.0, 0.0))], &rig, &config);
+        let map: TerrainMap = map.map_err(|e: TerrainError| e).unwrap();
+        assert!(
+            map.notices.iter().any(|n| n.contains("too far away")),
+            "{:?}",
+            map.notices
+        );
+        // 0.3 px of a rig of 10 px m are 3 % at a metre.
+        let farthest = map.voxels.iter().map(|v| v.mean.x).fold(0.0, f64::max);
+        assert!((0.5..1.1).contains(&farthest), "{farthest}");
     }
 
     #[test]

@@ -61,7 +61,7 @@ pub struct Dem {
     pub raster: Raster<f32>,
     /// Points of each cell, 0 where none fell; in the order of the raster.
     pub count: Vec<f32>,
-    /// Standard deviation of the heights of each cell's voxels, by their points, metres; NaN where
+    /// Standard deviation of the heights of each cell's voxels, by their weight, metres; NaN where
     /// none fell.
     pub spread: Vec<f32>,
     /// Points that lie far outside the extent of all others and were left out.
@@ -173,7 +173,8 @@ impl Raster<f32> {
     }
 }
 
-/// Elevation over the cells of a grid that holds all `voxels`, each weighted by its points.
+/// Elevation over the cells of a grid that holds all `voxels`, each weighted by how sure its points are
+/// ([`Voxel::weight`]).
 ///
 /// The grid is aligned to multiples of `cell` metres. A few points far away (a wrong match near
 /// infinity) would blow it up: those that lie farther outside the middle 99 % of the points than
@@ -224,30 +225,35 @@ pub fn dem(
         cell_y: cell,
     };
 
-    let mut heights: Vec<(usize, f64, f64)> = kept
+    let mut heights: Vec<Height> = kept
         .iter()
         .map(|v| {
             let [column, row] = cell_of(v);
             let index = (row - north) as usize * grid.width + (column - west) as usize;
-            (index, v.mean.z, f64::from(v.count))
+            Height {
+                cell: index,
+                z: v.mean.z,
+                weight: v.weight,
+                count: v.count,
+            }
         })
         .collect();
-    heights.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    heights.sort_unstable_by(|a, b| a.cell.cmp(&b.cell).then(a.z.total_cmp(&b.z)));
     let cells = grid.width * grid.height;
     let (mut values, mut spread) = (vec![f32::NAN; cells], vec![f32::NAN; cells]);
     let mut count = vec![0.0; cells];
-    for cell in heights.chunk_by(|a, b| a.0 == b.0) {
-        let index = cell[0].0;
+    for cell in heights.chunk_by(|a, b| a.cell == b.cell) {
+        let index = cell[0].cell;
         let mean = mean(cell);
-        let weight: f64 = cell.iter().map(|h| h.2).sum();
-        let squares: f64 = cell.iter().map(|h| h.2 * (h.1 - mean).powi(2)).sum();
-        count[index] = weight as f32;
+        let weight: f64 = cell.iter().map(|h| h.weight).sum();
+        let squares: f64 = cell.iter().map(|h| h.weight * (h.z - mean).powi(2)).sum();
+        count[index] = cell.iter().map(|h| h.count as f32).sum();
         spread[index] = (squares / weight).sqrt() as f32;
         values[index] = match statistic {
             CellStatistic::Mean => mean,
             CellStatistic::Median => quantile(cell, 0.5),
             CellStatistic::P10 => quantile(cell, 0.1),
-            CellStatistic::Max => cell[cell.len() - 1].1,
+            CellStatistic::Max => cell[cell.len() - 1].z,
         } as f32;
     }
     Ok(Dem {
@@ -274,23 +280,31 @@ fn extent(voxels: &[Voxel], coordinate: impl Fn(&Point3<f64>) -> f64) -> Option<
     Some((low - (high - low), high + (high - low)))
 }
 
-fn mean(heights: &[(usize, f64, f64)]) -> f64 {
-    let weight: f64 = heights.iter().map(|h| h.2).sum();
-    heights.iter().map(|h| h.1 * h.2).sum::<f64>() / weight
+/// The height of a voxel, and the cell that it counts for.
+struct Height {
+    cell: usize,
+    z: f64,
+    weight: f64,
+    count: u32,
+}
+
+fn mean(heights: &[Height]) -> f64 {
+    let weight: f64 = heights.iter().map(|h| h.weight).sum();
+    heights.iter().map(|h| h.z * h.weight).sum::<f64>() / weight
 }
 
 /// The height that a share of the weight lies below, of heights in ascending order; where the share
 /// ends between two, their mean.
-fn quantile(heights: &[(usize, f64, f64)], share: f64) -> f64 {
-    let wanted = share * heights.iter().map(|h| h.2).sum::<f64>();
+fn quantile(heights: &[Height], share: f64) -> f64 {
+    let wanted = share * heights.iter().map(|h| h.weight).sum::<f64>();
     let mut below = 0.0;
     for (i, h) in heights.iter().enumerate() {
-        below += h.2;
+        below += h.weight;
         if below > wanted || i + 1 == heights.len() {
-            return h.1;
+            return h.z;
         }
         if below == wanted {
-            return 0.5 * (h.1 + heights[i + 1].1);
+            return 0.5 * (h.z + heights[i + 1].z);
         }
     }
     f64::NAN
@@ -305,6 +319,7 @@ mod tests {
     fn voxel(x: f64, y: f64, z: f64, count: u32) -> Voxel {
         Voxel {
             count,
+            weight: f64::from(count),
             mean: Point3::new(x, y, z),
             linear_rgb: Vector3::zeros(),
         }

@@ -14,5 +14,6 @@ mod program;
 mod serve;
 mod settings;
 mod smoke;
+mod structured_light;
 mod survival;
 mod view;

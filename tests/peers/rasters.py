@@ -7,7 +7,7 @@ import numpy as np
 import rasterio
 from plyfile import PlyData
 
-from common import Table
+from common import Barchan, Table
 
 
 def check(table: Table, folder: Path) -> None:
@@ -53,6 +53,32 @@ def check(table: Table, folder: Path) -> None:
     table.at_most("hillshade.tif: cells blank in gdaldem's and not here", (wanted_blank & ~blank).sum(), 0)
     largest = np.abs(shade - wanted)[both].max() if both.any() else np.nan
     table.at_most("hillshade.tif: largest difference to gdaldem, of 255", largest, 1)
+
+
+def check_round_trip(table: Table, barchan: Barchan, shared: Path, work: Path) -> None:
+    """Rasters that others wrote: values come out of barchan bit by bit, and shades are gdaldem's to the pixel."""
+    random = np.random.default_rng(8)
+    heights = random.normal(1000, 300, (70, 113)).astype(np.float32)
+    place = rasterio.transform.from_origin(351234.5, 5612345.25, 0.25, 0.25)
+    theirs = work / "theirs.tif"
+    shape = {"height": 70, "width": 113, "count": 1, "dtype": "float32"}
+    with rasterio.open(theirs, "w", driver="GTiff", crs="EPSG:32632", transform=place, nodata=-9999.0, **shape) as file:
+        file.write(heights, 1)
+    barchan("raster", "fill", theirs, "--out", work / "ours.tif")
+    with rasterio.open(work / "ours.tif") as file:
+        table.equal("GeoTIFF of rasterio through barchan: values", bool((file.read(1) == heights).all()), True)
+        table.equal("GeoTIFF of rasterio through barchan: transform", file.transform == place, True)
+        table.equal("GeoTIFF of rasterio through barchan: CRS", str(file.crs), "EPSG:32632")
+
+    yard = shared / "marsyard2021" / "elevation.tif"
+    for name, dem in (("random heights", theirs), ("marsyard2021", yard)):
+        if not dem.is_file():
+            continue
+        barchan("raster", "hillshade", dem, "--out", work / "shade.tif")
+        with rasterio.open(work / "shade.tif") as file:
+            shade = file.read(1)
+        wanted = gdaldem_hillshade(dem, work / "gdaldem.tif")
+        table.at_most(f"hillshade of {name}: pixels that differ from gdaldem's", int((shade != wanted).sum()), 0)
 
 
 def gdaldem_hillshade(dem: Path, out: Path) -> np.ndarray:

@@ -71,6 +71,7 @@ def main() -> None:
 
     def terrain(table: Table) -> None:
         rasters.check(table, work / "map")
+        rasters.check_round_trip(table, barchan, shared, work)
 
     def formats(table: Table) -> None:
         files.check_disparity(table, work / "infer")
