@@ -1,3 +1,4 @@
+use barchan_geometry::RectifiedRig;
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Akaze, FeatureDetector, Orb};
@@ -64,6 +65,9 @@ pub struct SlamConfig {
     pub max_dissimilarity: f32,
     /// A key frame is made when matches fall under this share of the most since the last one.
     pub keyframe_ratio: f64,
+    /// It is made, too, when so small a share of what a frame could map is in the map: most of what it
+    /// sees is new, as behind the crest of a hill, and the map must have it before the old is out of sight.
+    pub keyframe_share: f64,
     /// Frames that may be tracked in the map as it was while a key frame comes into it; 0 waits for it.
     pub map_lag: usize,
     /// Key frames that bundle adjustment moves.
@@ -99,7 +103,7 @@ impl Default for SlamConfig {
             max_hamming_share: 0.25,
             akaze_max_hamming_share: 0.16,
             row_tolerance: 1.5,
-            min_disparity: 1.5,
+            min_disparity: 0.7,
             disparity_sigma: 2.0,
             match_sigma: 0.5,
             alignment_sigma: 0.5,
@@ -107,6 +111,7 @@ impl Default for SlamConfig {
             gate_px: 3.0,
             max_dissimilarity: 0.4,
             keyframe_ratio: 0.9,
+            keyframe_share: 0.35,
             map_lag: 2,
             window: 8,
             adjust_all: true,
@@ -132,6 +137,11 @@ impl SlamConfig {
                 most: self.features,
             }),
         }
+    }
+
+    /// Whether a point of such a disparity says enough of depth to be mapped.
+    pub(crate) fn is_mapped(&self, rig: &RectifiedRig, d: f64) -> bool {
+        d + rig.doffs >= self.min_disparity
     }
 
     /// Most differing bits of two descriptors of `bits` bits that match.

@@ -83,6 +83,12 @@ impl Seen {
         self.disparities.iter().flatten().count()
     }
 
+    /// How many of these a map would take.
+    pub fn mappable_count(&self, rig: &RectifiedRig, config: &SlamConfig) -> usize {
+        let known = self.disparities.iter().flatten();
+        known.filter(|d| config.is_mapped(rig, **d)).count()
+    }
+
     /// What people want to know of a frame that cannot be placed.
     pub fn describe(&self) -> String {
         let pixels = self.grey[0].as_raw();

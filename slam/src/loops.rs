@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::features::Descriptor;
-use crate::map::{Map, PointId};
+use crate::map::{Keyframe, Map, PointId};
 use crate::matching::{Grid, find_points, match_all};
 use crate::places::{Island, Places};
 use crate::pose::{Observation, optimise_pose, sample_pose};
@@ -20,10 +20,14 @@ use crate::pose_graph::{PoseEdge, PoseGraph};
 use crate::vocabulary::Vocabulary;
 use crate::{Keypoint, SlamConfig};
 
-/// Deviation of the motion between two key frames that see the same points: metres, radians.
+/// Deviation of the motion between two key frames that see the same points: metres at [`DEPTH`],
+/// radians.
 const NEIGHBOUR_SIGMA: (f64, f64) = (0.005, 0.0005);
-/// Deviation of the motion that a loop measures.
+/// Deviation of the motion that a loop measures, likewise.
 const LOOP_SIGMA: (f64, f64) = (0.01, 0.002);
+/// Metres. What is twice as far tells half as well where the camera is: among houses these deviations
+/// are many times those of a rover that looks at the ground before it.
+const DEPTH: f64 = 3.0;
 /// Deviation of the guess that leads over a gap in tracking.
 pub(crate) const GUESS_SIGMA: (f64, f64) = (10.0, 1.0);
 /// Key frames that share so many points are tied in the pose graph.
@@ -223,7 +227,7 @@ impl LoopCloser {
         let at = |k: &Keypoint| {
             let (u, v) = (k.u.round() as u32, k.v.round() as u32);
             let d = f64::from(dense?.get_pixel_checked(u, v)?.0[0]);
-            (d + self.rig.doffs >= self.config.min_disparity).then_some(d)
+            self.config.is_mapped(&self.rig, d).then_some(d)
         };
         let features = frame.features.keypoints.iter().zip(&frame.disparities);
         features.map(|(k, sparse)| at(k).or(*sparse)).collect()
@@ -339,11 +343,12 @@ impl LoopCloser {
     /// Solves the pose graph with the new loop in it, and moves key frames and points.
     #[allow(non_snake_case)]
     fn correct(&mut self, map: &mut Map, newest: usize, earlier: usize, found: &Found) {
+        let scale = (self.median_depth(&map.keyframes[newest]) / DEPTH).max(1.0);
         self.edges.push(PoseEdge {
             a: earlier,
             b: newest,
             T_a_b: map.keyframes[earlier].T_cam_world * found.T_cam_world.inverse(),
-            sigma_translation: LOOP_SIGMA.0,
+            sigma_translation: scale * LOOP_SIGMA.0,
             sigma_rotation: LOOP_SIGMA.1,
             robust: true,
         });
@@ -365,7 +370,8 @@ impl LoopCloser {
             // The first shares most.
             for (place, (other, count)) in shared.enumerate() {
                 if place == 0 || other + 1 == k || count >= COVISIBLE {
-                    edges.push(tie(other, k, NEIGHBOUR_SIGMA));
+                    let (translation, rotation) = NEIGHBOUR_SIGMA;
+                    edges.push(tie(other, k, (scale * translation, rotation)));
                 }
             }
             if edges.last().is_none_or(|e| e.b != k) {
@@ -389,6 +395,16 @@ impl LoopCloser {
         for (keyframe, T_world_cam) in map.keyframes.iter_mut().zip(&graph.T_world_cam) {
             keyframe.T_cam_world = T_world_cam.inverse();
         }
+    }
+
+    /// How far what a key frame sees is in the median, metres; zero when nothing of it has a depth.
+    fn median_depth(&self, keyframe: &Keyframe) -> f64 {
+        let known = keyframe.proof_disparities.iter().flatten();
+        let mut disparities: Vec<f64> = known.map(|d| d + self.rig.doffs).collect();
+        disparities.sort_by(f64::total_cmp);
+        let median = disparities.get(disparities.len() / 2).copied();
+        let depth = |d: f64| self.rig.fx * self.rig.baseline / d.max(self.config.min_disparity);
+        median.map_or(0.0, depth)
     }
 
     /// Makes points one that were mapped once at each visit: those that proved the loop, then what
@@ -474,7 +490,6 @@ fn connected(map: &Map, keyframe: usize) -> BTreeSet<usize> {
 mod tests {
     use super::*;
     use crate::features::Features;
-    use crate::map::Keyframe;
 
     /// Key frames of three features each, none of which sees a point.
     fn map(keyframes: usize) -> Map {

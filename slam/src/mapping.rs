@@ -242,8 +242,7 @@ fn add_new_points(
     for feature in 0..seen.disparities.len() {
         let frame = &map.keyframes[keyframe];
         let at = frame.features.keypoints[feature];
-        let Some(d) = seen.disparities[feature].filter(|d| d + rig.doffs >= config.min_disparity)
-        else {
+        let Some(d) = seen.disparities[feature].filter(|d| config.is_mapped(rig, *d)) else {
             continue;
         };
         let known = frame.points[feature].is_some();

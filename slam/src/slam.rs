@@ -209,13 +209,14 @@ impl Slam {
             ms_track: 0.0,
             mapped: None,
         };
+        let mappable = seen.mappable_count(&self.rig, &self.config);
         let enough_stereo = report.stereo >= self.config.min_inliers;
         if self.since_keyframe >= self.config.map_lag {
             report.mapped = self.settle()?;
         }
         let mut prediction = self.predict(frame.time);
         let mut placement = self.place_near(&seen, &prediction);
-        let does = |p: &Placement| !self.runs_low(p.sightings.len());
+        let does = |p: &Placement| !self.runs_low(p.sightings.len(), mappable);
         if self.mapping.is_busy() && !placement.as_ref().is_some_and(does) {
             report.mapped = self.settle()?;
             prediction = self.predict(frame.time);
@@ -237,7 +238,7 @@ impl Slam {
             self.lost = 0;
             self.most_inliers = self.most_inliers.max(report.inliers);
             self.tracker.moved_to(placement.T_cam_world, time);
-            if self.runs_low(report.inliers) {
+            if self.runs_low(report.inliers, mappable) {
                 let submap = here.unwrap_or(0);
                 self.make_keyframe(frame, seen, placement, submap, None, &mut report)?;
             } else {
@@ -376,10 +377,13 @@ impl Slam {
         self.tracker.track(seen, &prediction.T_cam_world, local)
     }
 
-    /// Whether so few inliers want a key frame.
-    fn runs_low(&self, inliers: usize) -> bool {
-        let most = self.most_inliers.max(inliers);
-        (inliers as f64) < self.config.keyframe_ratio * most as f64
+    /// Whether so few inliers want a key frame: few beside the most since the last one, or among all that
+    /// the frame could map.
+    fn runs_low(&self, inliers: usize, mappable: usize) -> bool {
+        let most = self.most_inliers.max(inliers) as f64;
+        let inliers = inliers as f64;
+        inliers < self.config.keyframe_ratio * most
+            || inliers < self.config.keyframe_share * mappable as f64
     }
 
     /// The surroundings of the newest key frame.

@@ -35,6 +35,12 @@ pub(crate) struct Sighting {
     pub at: Keypoint,
 }
 
+/// By how many deviations few matches must agree better than by chance: near the predicted pose, which
+/// is a witness too, and elsewhere.
+const NEAR: f64 = 3.5;
+/// See [`NEAR`].
+const FAR: f64 = 5.0;
+
 /// Follows the camera through a map that others build.
 pub(crate) struct Tracker {
     rig: RectifiedRig,
@@ -112,13 +118,15 @@ impl Tracker {
         local: &LocalMap,
         T_predicted: &Se3,
     ) -> Option<Placement> {
-        [12.0, 24.0, 48.0].into_iter().find_map(|radius| {
-            let matches = self.project_and_match(seen, local, T_predicted, radius);
-            let observations = self.observations(seen, local, &matches.pairs);
-            let rough = optimise_pose(&self.rig, &observations, T_predicted);
-            (rough.count() >= self.config.min_inliers)
-                .then(|| self.settle(seen, local, &rough.T_cam_world))?
-        })
+        [(12.0, NEAR), (24.0, NEAR), (48.0, FAR)]
+            .into_iter()
+            .find_map(|(radius, beyond)| {
+                let matches = self.project_and_match(seen, local, T_predicted, radius);
+                let observations = self.observations(seen, local, &matches.pairs);
+                let rough = optimise_pose(&self.rig, &observations, T_predicted);
+                (rough.count() >= self.config.min_inliers)
+                    .then(|| self.settle(seen, local, &rough.T_cam_world, beyond))?
+            })
     }
 
     /// Matches the nearest points by descriptor alone, samples a pose and settles it in the whole
@@ -136,7 +144,7 @@ impl Tracker {
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
         let T_sampled = sample_pose(&self.rig, &observations, self.config.min_inliers, &mut rng)?;
         let rough = optimise_pose(&self.rig, &observations, &T_sampled);
-        self.settle(seen, local, &rough.T_cam_world)
+        self.settle(seen, local, &rough.T_cam_world, FAR)
     }
 
     /// The last, narrow match around a pose that is nearly right, with sightings aligned to a
@@ -145,9 +153,16 @@ impl Tracker {
     /// Sand looks like sand: near a false pose a third of the points still find a corner that could
     /// be theirs. So a count proves nothing; a true pose explains most matches (four in five, where
     /// false ones were seen to explain half), and more than a few of the points in view. When a fast
-    /// motion leaves few matches, these must agree better than half of them could by chance.
+    /// motion or a crest, behind which most points in view are hidden, leaves few matches, these must
+    /// agree better than half of them could by chance: by so many deviations of a binomial distribution.
     #[allow(non_snake_case)]
-    fn settle(&self, seen: &Seen, local: &LocalMap, T_rough: &Se3) -> Option<Placement> {
+    fn settle(
+        &self,
+        seen: &Seen,
+        local: &LocalMap,
+        T_rough: &Se3,
+        deviations: f64,
+    ) -> Option<Placement> {
         const RADIUS: f64 = 6.0;
         let matches = self.project_and_match(seen, local, T_rough, RADIUS);
         let sightings: Vec<Sighting> = matches
@@ -166,9 +181,8 @@ impl Tracker {
         let pose = optimise_pose(&self.rig, &observations, T_rough);
         let count = pose.count();
         let explains = |share: f64, of: usize| count as f64 >= share * of as f64;
-        // Five deviations of a binomial distribution with an even chance.
         let n = matches.pairs.len() as f64;
-        let beyond_chance = count as f64 - 0.5 * n > 5.0 * (0.25 * n).sqrt();
+        let beyond_chance = count as f64 - 0.5 * n > deviations * (0.25 * n).sqrt();
         let holds = count >= self.config.min_inliers
             && explains(self.config.min_match_share, matches.pairs.len())
             && (explains(self.config.min_view_share, matches.in_view) || beyond_chance);
