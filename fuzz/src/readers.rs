@@ -119,9 +119,9 @@ pub const READERS: &[Reader] = &[
     ),
     reader(
         "katwijk-fixes",
-        "gps-utm31.txt",
-        |_, b| KATWIJK.opens_with("gps-utm31.txt", b),
-        || KATWIJK.table("gps-utm31.txt"),
+        "gps-latlong.txt",
+        |_, b| KATWIJK.opens_with("gps-latlong.txt", b),
+        || KATWIJK.table("gps-latlong.txt"),
     ),
     reader(
         "onnx",
