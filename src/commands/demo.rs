@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::Parser;
 
 use crate::commands::{data, eval, map, report, slam, train};
@@ -36,7 +36,10 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     let (rendered, slam_run, map_dir) = (inside("data"), inside("slam"), inside("map"));
     let data = match &args.data {
         Some(data) => {
-            let check: data::Args = typed(output, &["data", "check", data])?;
+            std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
+            let picture = inside("check.png");
+            let check = ["data", "check", data, "--picture", &picture];
+            let check: data::Args = typed(output, &check)?;
             if !data::run(check, output)? {
                 output.notice(
                     "the check found something, see above; what can be mended is mended on the way",

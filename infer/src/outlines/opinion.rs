@@ -88,7 +88,7 @@ mod tests {
     #[test]
     fn disparities_of_half_the_size_are_doubled_and_lie_where_they_were() {
         let grey = |x: i64, y: i64| {
-            let h = (x * 7919 ^ y * 104_729).wrapping_mul(2_654_435_761) >> 7;
+            let h = ((x * 7919) ^ (y * 104_729)).wrapping_mul(2_654_435_761) >> 7;
             image::Rgb([(h & 0xff) as f32 / 255.0; 3])
         };
         // Blocks of two pixels, so that half the size shows all there is.

@@ -194,7 +194,8 @@ fn pair_by_time(folder: &Path, files: Vec<Named>, camera: &str) -> Result<Vec<Ti
     Ok(pairs)
 }
 
-/// From the left localisation camera to the IMU, by the frames published with the archive: the IMU has x
+/// From the left localisation camera to the IMU, as the tools of other users of the archive have it (transforms.py of
+/// plusk01/katwijk_tools), for no file of the archive says it: the IMU has x
 /// backwards, y to the right and z up, and the camera looks along its -x, 18 degrees down.
 #[allow(non_snake_case)]
 fn T_imu_loc_cam() -> Se3 {
