@@ -55,8 +55,8 @@ pub struct MapConfig {
     /// Fewest points of a voxel that is kept. Default 2.
     pub min_points: u32,
     /// Edge of a cell of the DEM, metres. Default: twice the voxel where that is given; else five times the
-    /// distance of neighbouring samples on the ground that three quarters in the first key frame keep, so that one look
-    /// puts 25 points into most cells and the elevation map has enough of them; rounded to 1, 2 or 5 times a power of ten (0.02 m for a rover 0.3 m
+    /// median distance of neighbouring samples on the ground in the first key frame, so that one look puts
+    /// 25 points into a cell and the elevation map has enough of them; rounded to 1, 2 or 5 times a power of ten (0.02 m for a rover 0.3 m
     /// high, 0.2 m for one of 0.8 m and for a car).
     pub cell: Option<f64>,
     /// Largest deviation of depth over depth of a point that goes into a voxel. Default 0.025: on flat ground such a
@@ -487,7 +487,7 @@ fn sizes(rig: &RectifiedRig, cloud: &Cloud, config: &MapConfig) -> [f64; 2] {
     }
 }
 
-/// The distance of neighbouring samples on the ground that three quarters keep, metres: the root of the area that a pixel covers on the plane
+/// Median distance of neighbouring samples on the ground, metres: the root of the area that a pixel covers on the plane
 /// that fits the points, `z^3 / (fx fy h)` for a plane at the distance `h`.
 fn ground_spacing(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
     let positions: Vec<Point3<f64>> = cloud.points.iter().map(|p| p.position).collect();
@@ -500,8 +500,8 @@ fn ground_spacing(rig: &RectifiedRig, cloud: &Cloud, stride: usize) -> f64 {
             stride as f64 * (p.z.powi(3) / (rig.fx * rig.fy * height)).sqrt()
         })
         .collect();
-    let upper = spacings.len() * 3 / 4;
-    *spacings.select_nth_unstable_by(upper, f64::total_cmp).1
+    let middle = spacings.len() / 2;
+    *spacings.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// The nearest, as a ratio, of 1, 2 and 5 times a power of ten.

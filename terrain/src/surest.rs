@@ -51,7 +51,7 @@ mod tests {
             // May be the ground, is as sure as the ground, cannot be the ground, lies elsewhere.
             voxel(0.15, 0.25, 0.1),
             voxel(0.15, 0.05, 0.03),
-            voxel(0.15, 0.35, 0.1),
+            voxel(0.15, 0.45, 0.1),
             voxel(0.25, 0.05, 0.1),
         ];
         assert!((voxels[1].sigma() - 0.1).abs() < 1e-12);
