@@ -15,7 +15,7 @@ struct Rates {
 
 #[test]
 #[ignore = "minutes of rendering"]
-fn dense_points_prove_more_true_loops_and_no_false_ones() {
+fn dense_points_prove_no_fewer_true_loops_and_no_false_ones() {
     let mut rates = [Rates::default(); 2];
     for (seed, texture) in [(2, "rich"), (3, "rich"), (2, "low"), (3, "low")] {
         // A round and a third: the last third is seen again.
