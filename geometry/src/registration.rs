@@ -158,6 +158,25 @@ impl Reference {
     }
 }
 
+/// [`register`] from afar: with all that lies within `config.max_distance`, and from there with what lies within a quarter of
+/// it, so that what is far from the reference no longer draws.
+///
+/// # Errors
+/// As [`register`].
+pub fn register_from_afar(
+    estimate: &[Point3<f64>],
+    reference: &Reference,
+    initial: &Se3,
+    config: &IcpConfig,
+) -> Result<Registration, RegistrationError> {
+    let rough = register(estimate, reference, initial, config)?;
+    let near = IcpConfig {
+        max_distance: 0.25 * config.max_distance,
+        ..*config
+    };
+    register(estimate, reference, &rough.T_ref_est, &near)
+}
+
 /// Finds the motion that brings `estimate` onto `reference`, from `initial` on: Gauss-Newton steps on
 /// the distances between corresponding points, found anew each time.
 ///
@@ -349,6 +368,30 @@ mod tests {
             // Neighbours of a cloud of 250 points a square metre are 3 cm apart.
             assert!(found.overlap > 0.99 && found.rmse < 0.04, "{found:?}");
         }
+    }
+
+    #[test]
+    fn from_afar_ends_in_what_is_near() {
+        let reference = Reference::new(&cloud(12_000, 0)).unwrap();
+        let moved = Se3::new(
+            Vector3::new(0.08, -0.05, 0.06),
+            Vector3::new(0.01, -0.02, 0.03),
+        );
+        // A thing that stands half a metre above the ground, and that the reference does not have.
+        let lifted = |(k, p): (usize, &Point3<f64>)| match k % 5 {
+            0 => moved * (p + Vector3::new(0.0, 0.0, 0.5)),
+            _ => moved * p,
+        };
+        let estimate: Vec<_> = cloud(5000, 50_000).iter().enumerate().map(lifted).collect();
+        let config = IcpConfig {
+            max_distance: 1.0,
+            ..IcpConfig::default()
+        };
+        let off = |found: Registration| (found.T_ref_est * moved).translation.vector.norm();
+        let once = off(register(&estimate, &reference, &Se3::identity(), &config).unwrap());
+        let twice =
+            off(register_from_afar(&estimate, &reference, &Se3::identity(), &config).unwrap());
+        assert!(once > 0.05 && twice < 0.01, "{once} {twice}");
     }
 
     #[test]

@@ -339,18 +339,18 @@ fn trajectory(est: &Path, gt: &str, tolerance: f64, max_shift: f64, output: &Out
             .with_context(|| format!("{gt}: no true poses and no fixes"))?,
     };
     let s = score(&est, &truth, tolerance)?;
-    let shift = (max_shift > 0.0)
-        .then(|| time_shift(&est, &truth, max_shift).ok())
-        .flatten();
+    let shift = (max_shift > 0.0).then(|| time_shift(&est, &truth, max_shift));
     let rotation = s
         .rpe_rot_deg_per_m
         .map_or("truth has no rotation".into(), |r| format!("{r:.3} deg/m"));
-    let clocks = shift.map_or("not enough truth around the poses".into(), |s| {
-        format!(
+    let clocks = match &shift {
+        None => "not compared".into(),
+        Some(Err(e)) => format!("cannot be compared: {e}"),
+        Some(Ok(s)) => format!(
             "the estimate is {:.2} s ahead, give or take {:.2} s (Sim3 ATE {:.4} m, {:.4} m with that mended)",
             s.ahead, s.give_or_take, s.error_before, s.error_after
-        )
-    });
+        ),
+    };
     let text = format!(
         "frames           {}\nlength           {:.3} m\nATE, SE3         {:.4} m\nATE, Sim3        {:.4} m (scale {:.4})\n\
          RPE translation  {:.3} %\nRPE rotation     {rotation}\nclocks           {clocks}",
@@ -358,7 +358,7 @@ fn trajectory(est: &Path, gt: &str, tolerance: f64, max_shift: f64, output: &Out
     );
     let figures = TrajectoryFigures {
         score: s,
-        time_shift: shift,
+        time_shift: shift.and_then(Result::ok),
     };
     output.result(&figures, &text)
 }

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
-use barchan_geometry::registration::{IcpConfig, Reference, Registration, register};
+use barchan_geometry::registration::{IcpConfig, Reference, register_from_afar};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
 use barchan_terrain::{
@@ -312,25 +312,27 @@ fn registration(map: &TerrainMap, survey: &Path) -> Result<(Se3, String)> {
     const REACH: f64 = 2.0;
     /// Points of the map that are used: more change nothing but the time.
     const POINTS: usize = 50_000;
+    /// A smaller share of points near the survey is said to be doubtful: so a false fit looks.
+    const OVERLAP: f64 = 0.8;
     let points = map.cloud().points;
     let step = points.len().div_ceil(POINTS).max(1);
     let sample: Vec<_> = points.iter().step_by(step).map(|p| p.position).collect();
     let reference =
         Reference::new(&read_points(survey)?).with_context(|| survey.display().to_string())?;
-    // First from afar, then with what is near alone.
-    let mut found: Option<Registration> = None;
-    for max_distance in [REACH, 0.25 * REACH] {
-        let start = found.map_or(Se3::identity(), |f| f.T_ref_est);
-        let config = IcpConfig {
-            max_distance,
-            ..IcpConfig::default()
-        };
-        let next = register(&sample, &reference, &start, &config);
-        found = Some(next.with_context(|| survey.display().to_string())?);
-    }
-    let found = found.context("two passes are made")?;
+    let config = IcpConfig {
+        max_distance: REACH,
+        ..IcpConfig::default()
+    };
+    let found = register_from_afar(&sample, &reference, &Se3::identity(), &config)
+        .with_context(|| survey.display().to_string())?;
+    let doubt = match found.overlap < OVERLAP {
+        true => {
+            "; that is few, and the fit may be false\n  cure: --align brings the map near the survey first"
+        }
+        false => "",
+    };
     let text = format!(
-        "registered to {}: moved by {:.3} m and {:.3} degrees, {:.0} % of its points lie within {} m of the survey, RMSE {:.3} m",
+        "registered to {}: moved by {:.3} m and {:.3} degrees, {:.0} % of its points lie within {} m of the survey, RMSE {:.3} m{doubt}",
         survey.display(),
         found.translation,
         found.rotation_deg,

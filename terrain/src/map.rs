@@ -275,7 +275,7 @@ impl VoxelScene {
         let mut notices = Vec::new();
         if unsure > 0 {
             notices.push(format!(
-                "{unsure} of {} points ({:.0} %) are too far away for depth to be known to {:.0} % and were left out of the cloud",
+                "{unsure} of {} points ({:.0} %) are too far away for depth to be known to {:.1} % and were left out of the cloud",
                 points + unsure,
                 100.0 * unsure as f64 / (points + unsure) as f64,
                 100.0 * max_sigma
@@ -522,7 +522,7 @@ fn nothing(keyframes: usize, config: &MapConfig) -> TerrainError {
         "there are no key frames".into()
     } else {
         format!(
-            "none of {keyframes} key frames has a pixel that passes the depth limits {:?} and whose depth is known to {:.0} %\n  \
+            "none of {keyframes} key frames has a pixel that passes the depth limits {:?} and whose depth is known to {:.1} %\n  \
              cure: look at the disparity (barchan infer), or loosen the limits",
             config.limits,
             100.0 * config.max_relative_sigma
