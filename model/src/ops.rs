@@ -74,6 +74,15 @@ pub trait Ops {
         bins: usize,
         x: &Self::Map,
     ) -> Self::Map;
+    /// [`Ops::conv2d_per_bin`] of single pixels, then [`Ops::depth_to_space`] of 2: a transposed convolution with a bias
+    /// for each of the four pixels.
+    fn doubling_conv2d_per_bin(
+        &mut self,
+        name: &str,
+        layer: &Conv2d,
+        bins: usize,
+        x: &Self::Map,
+    ) -> Self::Map;
     /// A learned convolution over `bins` at every pixel, zero outside.
     fn disparity_mix(
         &mut self,
@@ -123,6 +132,8 @@ pub trait Ops {
     fn sub(&mut self, a: &Self::Map, b: &Self::Map) -> Self::Map;
     /// `a b`.
     fn mul(&mut self, a: &Self::Map, b: &Self::Map) -> Self::Map;
+    /// Each of `bins` equal shares of the channels of `a` times `b`.
+    fn mul_per_bin(&mut self, bins: usize, a: &Self::Map, b: &Self::Map) -> Self::Map;
     /// `a / b`.
     fn div(&mut self, a: &Self::Map, b: &Self::Map) -> Self::Map;
     /// `scale x + offset`.
@@ -145,18 +156,18 @@ pub trait Ops {
     fn channel_max(&mut self, x: &Self::Map) -> Self::Map;
     /// The number of the largest channel at every pixel.
     fn channel_argmax(&mut self, x: &Self::Map) -> Self::Map;
-    /// The sum of every 3x3 neighbour, `reach` pixels apart (row by row, the border repeated), of a map of one channel, times its
-    /// weights: channel `n * shares + s` of `weights` is that of neighbour `n` in share `s`. `shares` channels.
-    fn mix_neighbours(
+    /// Weighted means of the 3x3 neighbours of every pixel, `reach` pixels apart (row by row, the border repeated):
+    /// channel `n * shares + s` of `weights` is that of neighbour `n` in share `s`. Each of the `channels` of `x`
+    /// becomes `shares` channels.
+    fn mean_of_neighbours(
         &mut self,
         name: &str,
         shares: usize,
         reach: usize,
         weights: &Self::Map,
+        channels: usize,
         x: &Self::Map,
     ) -> Self::Map;
-    /// What [`Ops::mix_neighbours`] makes of ones.
-    fn sum_neighbours(&mut self, name: &str, shares: usize, weights: &Self::Map) -> Self::Map;
     /// One constant a channel, `[1, n, 1, 1]`.
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> Self::Map;
     /// `a + b`.
@@ -166,8 +177,8 @@ pub trait Ops {
     fn join(&mut self, first: &Self::Map, second: &Self::Map) -> Self::Map;
     /// Undoes [`Ops::join`].
     fn halves(&mut self, x: &Self::Map) -> (Self::Map, Self::Map);
-    /// All channels, `times` over.
-    fn repeat_channels(&mut self, times: usize, x: &Self::Map) -> Self::Map;
+    /// Each channel for itself.
+    fn split_channels<const N: usize>(&mut self, x: &Self::Map) -> [Self::Map; N];
     /// Maps after one another as channels.
     fn concat(&mut self, maps: &[Self::Map]) -> Self::Map;
     /// Volumes after one another as channels.
@@ -194,6 +205,8 @@ pub trait Ops {
 
 /// Pixels of a 3x3 neighbourhood.
 pub(crate) const NEIGHBOURS: usize = 9;
+/// What is added to a sum of weights, so that it is never zero.
+pub(crate) const LEAST_WEIGHT: f32 = 1e-12;
 
 /// Executes at once, with Burn.
 pub struct Execute {
@@ -222,6 +235,16 @@ impl Ops for Execute {
         );
         let [_, channels, height, width] = y.dims();
         y.reshape([batch, bins * channels, height, width])
+    }
+    fn doubling_conv2d_per_bin(
+        &mut self,
+        name: &str,
+        layer: &Conv2d,
+        bins: usize,
+        x: &Tensor<4>,
+    ) -> Tensor<4> {
+        let y = self.conv2d_per_bin(name, layer, bins, x);
+        self.depth_to_space(2, &y)
     }
     fn disparity_mix(
         &mut self,
@@ -299,6 +322,9 @@ impl Ops for Execute {
     fn mul(&mut self, a: &Tensor<4>, b: &Tensor<4>) -> Tensor<4> {
         a.clone() * b.clone()
     }
+    fn mul_per_bin(&mut self, bins: usize, a: &Tensor<4>, b: &Tensor<4>) -> Tensor<4> {
+        a.clone() * b.clone().repeat_dim(1, bins)
+    }
     fn div(&mut self, a: &Tensor<4>, b: &Tensor<4>) -> Tensor<4> {
         a.clone() / b.clone()
     }
@@ -335,12 +361,13 @@ impl Ops for Execute {
     fn channel_argmax(&mut self, x: &Tensor<4>) -> Tensor<4> {
         x.clone().detach().argmax(1).float()
     }
-    fn mix_neighbours(
+    fn mean_of_neighbours(
         &mut self,
         _: &str,
         shares: usize,
         reach: usize,
         weights: &Tensor<4>,
+        channels: usize,
         x: &Tensor<4>,
     ) -> Tensor<4> {
         let [batch, _, height, width] = x.dims();
@@ -351,19 +378,13 @@ impl Ops for Execute {
                 row.narrow(3, reach * (n % 3), width)
             })
             .collect();
-        let around = Tensor::cat(around, 1).reshape([batch, NEIGHBOURS, 1, height, width]);
-        let weights = weights
-            .clone()
-            .reshape([batch, NEIGHBOURS, shares, height, width]);
-        (weights * around).sum_dim(1).squeeze_dim(1)
-    }
-    fn sum_neighbours(&mut self, _: &str, shares: usize, weights: &Tensor<4>) -> Tensor<4> {
-        let [batch, _, height, width] = weights.dims();
-        weights
-            .clone()
-            .reshape([batch, NEIGHBOURS, shares, height, width])
-            .sum_dim(1)
-            .squeeze_dim(1)
+        let pixels = height * width;
+        let around: Tensor<5> =
+            Tensor::stack::<5>(around, 2).reshape([batch, channels, NEIGHBOURS, 1, pixels]);
+        let weights = (weights.clone()).reshape([batch, 1, NEIGHBOURS, shares, pixels]);
+        let total = weights.clone().sum_dim(2) + LEAST_WEIGHT;
+        let mean = (weights * around).sum_dim(2) / total;
+        mean.reshape([batch, channels * shares, height, width])
     }
     fn channel_constant(&mut self, _: &str, values: &[f32]) -> Tensor<4> {
         Tensor::from_data(
@@ -385,8 +406,8 @@ impl Ops for Execute {
             x.clone().narrow(0, half, half),
         )
     }
-    fn repeat_channels(&mut self, times: usize, x: &Tensor<4>) -> Tensor<4> {
-        x.clone().repeat_dim(1, times)
+    fn split_channels<const N: usize>(&mut self, x: &Tensor<4>) -> [Tensor<4>; N] {
+        std::array::from_fn(|k| x.clone().narrow(1, k, 1))
     }
     fn concat(&mut self, maps: &[Tensor<4>]) -> Tensor<4> {
         Tensor::cat(maps.to_vec(), 1)

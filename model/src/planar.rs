@@ -143,8 +143,7 @@ impl Finest {
         seen: &O::Map,
     ) -> O::Map {
         let name = |layer: &str| format!("aggregation.finest.{layer}");
-        let up = ops.conv2d_per_bin(&name("up"), &self.up, bins, eighth);
-        let up = ops.depth_to_space(2, &up);
+        let up = ops.doubling_conv2d_per_bin(&name("up"), &self.up, bins, eighth);
         let raw = ops.conv2d_per_bin(&name("raw"), &self.raw, bins, raw);
         let x = ops.add(&up, &raw);
         let x = ops.relu(&x);
@@ -154,8 +153,7 @@ impl Finest {
         // The image says on which side of a pixel its surface goes on.
         let gate = ops.conv2d(&name("gate"), &self.gate, seen);
         let gate = ops.sigmoid(&gate);
-        let gate = ops.repeat_channels(bins, &gate);
-        let x = ops.mul(&x, &gate);
+        let x = ops.mul_per_bin(bins, &x, &gate);
         ops.disparity_mix(&name("out"), &self.out, bins, &x)
     }
 }
@@ -269,8 +267,7 @@ impl Planar {
         let (seen, _) = ops.halves(&features.eighth);
         let gate = ops.conv2d(&name("gate"), &self.gate, &seen);
         let gate = ops.sigmoid(&gate);
-        let gate = ops.repeat_channels(bins8, &gate);
-        let mut up = ops.mul(&up, &gate);
+        let mut up = ops.mul_per_bin(bins8, &up, &gate);
         for (i, block) in self.decoder.iter().enumerate() {
             up = block.forward(ops, &name(&format!("decoder.{i}")), bins8, &up);
         }

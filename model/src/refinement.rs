@@ -11,7 +11,7 @@ use burn::tensor::{Device, TensorData};
 use crate::Ops;
 use crate::features::{conv1x1, conv3x3};
 use crate::ops::NEIGHBOURS;
-use crate::regression::Moments;
+use crate::regression::{MOMENTS, Moments};
 
 /// Reaches of the neighbours that are mixed, one after the other, pixels of the coarse resolution: an answer
 /// travels up to 28 pixels of the image in each direction.
@@ -55,13 +55,14 @@ impl Refinement {
         }
     }
 
-    /// Better moments, and features that know of them, from the left image's features `[B, context, h, w]`.
+    /// Better moments, one channel each, and features that know of them, from the left image's features `[B, context,
+    /// h, w]`.
     pub(crate) fn forward<O: Ops>(
         &self,
         ops: &mut O,
         moments: &Moments<O::Map>,
         context: &O::Map,
-    ) -> (Moments<O::Map>, O::Map) {
+    ) -> (O::Map, O::Map) {
         let name = |layer: &str| format!("refinement.{layer}");
         // Of the order of one, as the features are.
         let disparity = ops.affine(0.25, 0.0, &moments.mean);
@@ -81,21 +82,12 @@ impl Refinement {
         let features = ops.add(context, &features);
         let features = ops.relu(&features);
 
-        let mut mixed = moments.clone();
+        let mut mixed = moments.as_channels(ops);
         for (k, (reach, layer)) in REACHES.into_iter().zip(&self.weights).enumerate() {
             let weights = ops.conv2d(&name(&format!("weights.{k}")), layer, &features);
             let weights = ops.sigmoid(&weights);
-            let total = ops.sum_neighbours(&name(&format!("total.{k}")), 1, &weights);
-            let total = ops.affine(1.0, 1e-12, &total);
-            let mut mix = |what: &str, x: &O::Map| {
-                let x = ops.mix_neighbours(&name(&format!("{what}.{k}")), 1, reach, &weights, x);
-                ops.div(&x, &total)
-            };
-            mixed = Moments {
-                mean: mix("mean", &mixed.mean),
-                square: mix("square", &mixed.square),
-                confidence: mix("confidence", &mixed.confidence),
-            };
+            let mean = name(&format!("mean.{k}"));
+            mixed = ops.mean_of_neighbours(&mean, 1, reach, &weights, MOMENTS, &mixed);
         }
         (mixed, features)
     }

@@ -55,31 +55,19 @@ impl Regression {
         let coarse = moments(ops, bins, argmin, logits);
         let (coarse, context) = match refinement {
             Some(refinement) => refinement.forward(ops, &coarse, context),
-            None => (coarse, context.clone()),
+            None => (coarse.as_channels(ops), context.clone()),
         };
-        let Moments {
-            mean,
-            square,
-            confidence,
-        } = coarse;
 
         let hidden = ops.conv2d("regression.look", &self.look, &context);
         let hidden = ops.relu(&hidden);
         let mix = ops.conv2d("regression.mix", &self.mix, &hidden);
         // Positive weights over their sum. Far below zero a sigmoid is an exponential, so this chooses as a
-        // softmax does; it joins the convolution before it, and its sum is a convolution too.
+        // softmax does, and it joins the convolution before it.
         let weights = ops.sigmoid(&mix);
-        let total = ops.sum_neighbours("regression.weights", SUBPIXELS, &weights);
-        let total = ops.affine(1.0, 1e-12, &total);
-        let up_sample = |ops: &mut O, name: &str, x: &O::Map| {
-            let mixed =
-                ops.mix_neighbours(&format!("regression.{name}"), SUBPIXELS, 1, &weights, x);
-            let mixed = ops.div(&mixed, &total);
-            ops.depth_to_space(SCALE, &mixed)
-        };
-        let mean = up_sample(ops, "mean", &mean);
-        let square = up_sample(ops, "square", &square);
-        let confidence = up_sample(ops, "confidence", &confidence);
+        let fine =
+            ops.mean_of_neighbours("regression.mean", SUBPIXELS, 1, &weights, MOMENTS, &coarse);
+        let fine = ops.depth_to_space(SCALE, &fine);
+        let [mean, square, confidence] = ops.split_channels(&fine);
 
         // The mixed moments are those of the mixed distribution, so their variance includes the
         // disagreement of the neighbours. A certain answer between two bins needs both, a share f of
@@ -111,6 +99,19 @@ pub(crate) struct Moments<M> {
     pub square: M,
     /// Probability near the peak, or near the mean.
     pub confidence: M,
+}
+
+/// How many [`Moments`] there are.
+pub(crate) const MOMENTS: usize = 3;
+
+impl<M: Clone> Moments<M> {
+    pub fn as_channels<O: Ops<Map = M>>(&self, ops: &mut O) -> M {
+        ops.concat(&[
+            self.mean.clone(),
+            self.square.clone(),
+            self.confidence.clone(),
+        ])
+    }
 }
 
 fn moments<O: Ops>(ops: &mut O, bins: usize, argmin: Argmin, logits: &O::Map) -> Moments<O::Map> {

@@ -47,14 +47,17 @@ impl GraphBuilder {
         name
     }
 
-    /// The two halves of `x` along an axis.
-    pub fn halves(&mut self, axis: i64, x: &str) -> (String, String) {
-        let first = self.node("halves", "Split", &[x], vec![Attribute::int("axis", axis)]);
-        let second = self.unique("halves.second");
+    /// Splits an axis into `N` equal parts. Nodes and outputs are named after `name`.
+    pub fn split<const N: usize>(&mut self, name: &str, axis: i64, x: &str) -> [String; N] {
+        let first = self.node(name, "Split", &[x], vec![Attribute::int("axis", axis)]);
+        let outputs: [String; N] = std::array::from_fn(|k| match k {
+            0 => first.clone(),
+            k => self.unique(&format!("{name}.{k}")),
+        });
         if let Some(node) = self.nodes.last_mut() {
-            node.output.push(second.clone());
+            node.output = outputs.to_vec();
         }
-        (first, second)
+        outputs
     }
 
     /// A node named after its operator.

@@ -7,7 +7,7 @@ use burn::nn::conv::{Conv2d, Conv3d, ConvTranspose3d};
 use burn::nn::{PaddingConfig2d, PaddingConfig3d};
 use burn::tensor::Tensor;
 
-use crate::ops::NEIGHBOURS;
+use crate::ops::{LEAST_WEIGHT, NEIGHBOURS};
 use crate::planar::DisparityMix;
 use crate::{Correlated, Kernel, Ops};
 
@@ -155,6 +155,41 @@ impl Ops for GraphWriter {
             Attribute::int("group", bins as i64),
         ];
         self.graph.node(name, "Conv", &inputs, attributes)
+    }
+    /// A transposed convolution, which is several times faster than `DepthToSpace`. It has one bias for all four
+    /// pixels; theirs are the weights of one more channel, of ones.
+    fn doubling_conv2d_per_bin(
+        &mut self,
+        name: &str,
+        layer: &Conv2d,
+        bins: usize,
+        x: &String,
+    ) -> String {
+        let [output, input, ..] = layer.weight.dims();
+        let apart = self.channels_reshaped(&format!("{name}.apart"), input, x);
+        let (pads, one) = (
+            self.graph.ints(&[0, 0, 0, 0, 0, 1, 0, 0]),
+            self.graph.scalar(1.0),
+        );
+        let with_ones = self.graph.plain("Pad", &[&apart, &pads, &one], vec![]);
+        let weight = self.graph.shared(
+            &format!("{name}.weight"),
+            &[input + 1, output / 4, 2, 2],
+            || {
+                let weight = layer.weight.val().reshape([output, input]).transpose();
+                let bias = (layer.bias.as_ref())
+                    .map_or_else(|| vec![0.0; output], |bias| values(&bias.val()));
+                [values(&weight), bias].concat()
+            },
+        );
+        let attributes = vec![
+            Attribute::ints("kernel_shape", &[2, 2]),
+            Attribute::ints("strides", &[2, 2]),
+        ];
+        let y = self
+            .graph
+            .node(name, "ConvTranspose", &[&with_ones, &weight], attributes);
+        self.channels_reshaped(&format!("{name}.together"), bins * output / 4, &y)
     }
     fn disparity_mix(
         &mut self,
@@ -304,6 +339,18 @@ impl Ops for GraphWriter {
     fn mul(&mut self, a: &String, b: &String) -> String {
         self.graph.plain("Mul", &[a, b], vec![])
     }
+    fn mul_per_bin(&mut self, bins: usize, a: &String, b: &String) -> String {
+        let size = self.height_and_width(a);
+        let bins = bins as i64;
+        let [apart, one, together] = [&[0, bins, -1][..], &[0, 1, -1], &[0, -1]].map(|counts| {
+            let counts = self.graph.ints(counts);
+            self.concat_shape(&[&counts, &size])
+        });
+        let a = self.graph.plain("Reshape", &[a, &apart], vec![]);
+        let b = self.graph.plain("Reshape", &[b, &one], vec![]);
+        let product = self.graph.plain("Mul", &[&a, &b], vec![]);
+        self.graph.plain("Reshape", &[&product, &together], vec![])
+    }
     fn div(&mut self, a: &String, b: &String) -> String {
         self.graph.plain("Div", &[a, b], vec![])
     }
@@ -357,30 +404,46 @@ impl Ops for GraphWriter {
         let to = vec![Attribute::int("to", FLOAT.into())];
         self.graph.plain("Cast", &[&largest], to)
     }
-    /// Convolutions with fixed kernels: they run in the layout of those before and after.
-    fn mix_neighbours(
+    fn mean_of_neighbours(
         &mut self,
         name: &str,
         shares: usize,
         reach: usize,
         weights: &String,
+        channels: usize,
         x: &String,
     ) -> String {
         let side = 2 * reach + 1;
-        let around = Kernel::from_fn([NEIGHBOURS * shares, 1, side, side], |c, _, y, x| {
-            let n = c / shares;
-            f32::from((y, x) == (reach * (n / 3), reach * (n % 3)))
-        });
+        let around = Kernel::from_fn(
+            [channels * NEIGHBOURS, channels, side, side],
+            |c, from, y, x| {
+                let n = c % NEIGHBOURS;
+                f32::from(c / NEIGHBOURS == from && (y, x) == (reach * (n / 3), reach * (n % 3)))
+            },
+        );
         let padded = self.pad_edge([reach; 4], x);
         let around = self.fixed_conv2d(&format!("{name}.around"), &around, 1, &padded);
-        let weighted = self.mul(weights, &around);
-        self.sum_neighbours(&format!("{name}.mix"), shares, &weighted)
-    }
-    fn sum_neighbours(&mut self, name: &str, shares: usize, weights: &String) -> String {
-        let sum = Kernel::from_fn([shares, NEIGHBOURS * shares, 1, 1], |s, c, _, _| {
-            f32::from(c % shares == s)
-        });
-        self.fixed_conv2d(name, &sum, 1, weights)
+        // `[batch, channel, neighbour, share, pixel]`.
+        let neighbours = NEIGHBOURS as i64;
+        let apart = self.graph.ints(&[0, channels as i64, neighbours, 1, -1]);
+        let around = self.graph.plain("Reshape", &[&around, &apart], vec![]);
+        let apart = self.graph.ints(&[0, 1, neighbours, shares as i64, -1]);
+        let weights = self.graph.plain("Reshape", &[weights, &apart], vec![]);
+        let sum = |this: &mut Self, what: &str, x: &String| {
+            let axis = this.graph.ints(&[2]);
+            let keep = vec![Attribute::int("keepdims", 1)];
+            this.graph
+                .node(&format!("{name}.{what}"), "ReduceSum", &[x, &axis], keep)
+        };
+        let total = sum(self, "total", &weights);
+        let total = self.affine(1.0, LEAST_WEIGHT, &total);
+        let weighted = self.mul(&weights, &around);
+        let mixed = sum(self, "mix", &weighted);
+        let mean = self.div(&mixed, &total);
+        let size = self.height_and_width(x);
+        let start = self.graph.ints(&[0, (channels * shares) as i64]);
+        let shape = self.concat_shape(&[&start, &size]);
+        self.graph.plain("Reshape", &[&mean, &shape], vec![])
     }
     fn channel_constant(&mut self, name: &str, values: &[f32]) -> String {
         self.graph
@@ -395,10 +458,10 @@ impl Ops for GraphWriter {
         self.graph.plain("Concat", &[first, second], axis)
     }
     fn halves(&mut self, x: &String) -> (String, String) {
-        self.graph.halves(0, x)
+        self.graph.split("halves", 0, x).into()
     }
-    fn repeat_channels(&mut self, times: usize, x: &String) -> String {
-        self.concat(&vec![x.clone(); times])
+    fn split_channels<const N: usize>(&mut self, x: &String) -> [String; N] {
+        self.graph.split("channels", 1, x)
     }
     fn concat(&mut self, maps: &[String]) -> String {
         let inputs: Vec<&str> = maps.iter().map(String::as_str).collect();
