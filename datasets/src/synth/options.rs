@@ -37,7 +37,8 @@ dust=0            specks of dust on each lens
 rectified=true    false: images of a distorted, crooked rig, rectified on reading
 sensor_noise=true false: IMU, odometry and GNSS without noise and bias
 synth:scenes      random shapes instead of a traverse: seed, frames, width, height, baseline, noise,
-                  and clutter=1, 0 for a few large things with rich texture
+                  clutter=1, 0 for a few large things with rich texture, and
+                  bare=0, how many large things with next to no texture there are besides at most
 synth:planes      flat walls at five tilts and growing distances, for `barchan noise`: the options of scenes";
 
 /// How a place looks.
@@ -102,6 +103,8 @@ pub(super) struct Options {
     pub sensor_noise: bool,
     /// Of random scenes: 0 for a few large things with rich texture, 1 for all there is.
     pub clutter: f64,
+    /// Of random scenes: how many large things with next to no texture there are besides at most.
+    pub bare: usize,
 }
 
 /// What the cameras do to the light; see [`OPTIONS`].
@@ -155,6 +158,7 @@ impl Default for Options {
             rectified: true,
             sensor_noise: true,
             clutter: 1.0,
+            bare: 0,
         }
     }
 }
@@ -176,7 +180,7 @@ impl Options {
                 };
             if !known {
                 let keys = if scenes {
-                    format!("{}, clutter", COMMON.join(", "))
+                    format!("{}, clutter, bare", COMMON.join(", "))
                 } else {
                     format!("{}, {}", COMMON.join(", "), ROVER.join(", "))
                 };
@@ -214,6 +218,7 @@ impl Options {
     fn set_scenes(&mut self, read: &Reader) -> Result<bool, DataError> {
         match read.key {
             "clutter" => self.clutter = read.within(0.0, 1.0, "a number")?,
+            "bare" => self.bare = read.within(0, 100, "a whole number")?,
             _ => return Ok(false),
         }
         Ok(true)

@@ -79,7 +79,7 @@ impl RandomScenes {
         rng.set_stream(index as u64);
         let shapes = match self.only_walls {
             true => Shapes::wall(&self.rig, &self.materials, index, self.len(), &mut rng),
-            false => Shapes::random(&self.rig, &self.materials, self.options.clutter, &mut rng),
+            false => Shapes::random(&self.rig, &self.materials, &self.options, &mut rng),
         };
         Ok((shapes, rng))
     }
@@ -422,6 +422,29 @@ impl Stage<'_> {
         self.paint(body, centre, axes)
     }
 
+    /// A large body with next to no texture: only its outline and its shading tell where it is.
+    fn bare(&mut self) -> Shape {
+        let centre = self.place();
+        let size = self.pixels(centre.z, self.rig.width as f64);
+        let [a, b] =
+            [0.12; 2].map(|least| size * least * 3.75f64.powf(self.rng.random_range(0.0..1.0)));
+        let c = a.min(b) * self.rng.random_range(0.3..0.8);
+        let body = match self.rng.random_range(0..4) {
+            0 => Body::Rectangle(a, b),
+            1 => Body::Ellipsoid(Vector3::new(a, b, c)),
+            _ => Body::Faces(Rock::random(
+                Point3::origin(),
+                Vector3::new(a, b, c),
+                self.rng,
+            )),
+        };
+        let axes = self.turn(0.9);
+        Shape {
+            contrast: self.rng.random_range(0.0..0.08),
+            ..self.paint(body, centre, axes)
+        }
+    }
+
     /// Many alike, in a row as bars of a fence: the background is seen between them.
     fn fence(&mut self) -> Vec<Shape> {
         let centre = self.place();
@@ -512,9 +535,10 @@ impl<'a> Shapes<'a> {
     fn random(
         rig: &RectifiedRig,
         materials: &'a [Texture<3>],
-        clutter: f64,
+        options: &Options,
         rng: &mut ChaCha8Rng,
     ) -> Self {
+        let clutter = options.clutter;
         let most = |least: u32, all: u32| least + (f64::from(all - least) * clutter).round() as u32;
         // Depths by disparity: the wall at 0.5 to 6 % of the width, shapes up to 28 %.
         let depth = |share: f64| rig.fx * rig.baseline / (share * rig.width as f64);
@@ -554,6 +578,11 @@ impl<'a> Shapes<'a> {
         }
         for _ in 0..stage.rng.random_range(0..most(1, 4)) {
             shapes.extend(stage.twig());
+        }
+        if options.bare > 0 {
+            for _ in 0..stage.rng.random_range(1..=options.bare) {
+                shapes.push(stage.bare());
+            }
         }
         let to_lamp = Vector3::new(
             rng.random_range(-1.0..1.0),
