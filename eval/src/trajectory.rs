@@ -4,7 +4,7 @@
 //! Truth may hold positions only (planar survey points carry no rotation). It is recognised by all
 //! its rotations being the same, and then no figure uses a true rotation: see [`TrajectoryScore`].
 
-use barchan_geometry::nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use barchan_geometry::nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use serde::Serialize;
 
@@ -276,17 +276,34 @@ pub fn umeyama(
     })
 }
 
+/// What brings an estimated trajectory to another.
+#[derive(Clone, Copy, Debug)]
+#[allow(non_snake_case)]
+pub struct Alignment {
+    /// The rigid motion.
+    pub T_truth_est: Se3,
+    /// The mean square of what is left: position and rotation vector of the other about the estimate, along the axes
+    /// of the estimate's world. Without rotations in the other, those are zero.
+    pub residual: Matrix6<f64>,
+}
+
 /// The rigid motion `T_truth_est` that brings an estimated trajectory nearest to another, by positions
 /// and, where the other has rotations, by three points a metre along the axes of each camera, which
 /// settle the rotation of a straight drive too.
 ///
 /// # Errors
 /// As [`associate`] and [`umeyama`].
-pub fn align(estimate: &Trajectory, truth: &Trajectory, tolerance: f64) -> Result<Se3, EvalError> {
+#[allow(non_snake_case)]
+pub fn align(
+    estimate: &Trajectory,
+    truth: &Trajectory,
+    tolerance: f64,
+) -> Result<Alignment, EvalError> {
     let pairs = associate(estimate, truth, tolerance)?;
-    let axes: &[Vector3<f64>] = match holds_positions_only(&pairs.T_world_cam_true) {
-        true => &[],
-        false => &[
+    let rotates = !holds_positions_only(&pairs.T_world_cam_true);
+    let axes: &[Vector3<f64>] = match rotates {
+        false => &[],
+        true => &[
             Vector3::new(1.0, 0.0, 0.0),
             Vector3::new(0.0, 1.0, 0.0),
             Vector3::new(0.0, 0.0, 1.0),
@@ -305,10 +322,26 @@ pub fn align(estimate: &Trajectory, truth: &Trajectory, tolerance: f64) -> Resul
         &points(&pairs.T_world_cam_true),
         false,
     )?;
-    Ok(Se3::from_parts(
+    let T_truth_est = Se3::from_parts(
         found.translation.into(),
         UnitQuaternion::from_rotation_matrix(&found.rotation),
-    ))
+    );
+    let T_est_truth = T_truth_est.inverse();
+    let poses = pairs.T_world_cam_est.iter().zip(&pairs.T_world_cam_true);
+    let squares = poses.map(|(est, truth)| {
+        let truth = T_est_truth * truth;
+        let moved = truth.translation.vector - est.translation.vector;
+        let turned = match rotates {
+            true => (truth.rotation * est.rotation.inverse()).scaled_axis(),
+            false => Vector3::zeros(),
+        };
+        let residual = Vector6::new(moved.x, moved.y, moved.z, turned.x, turned.y, turned.z);
+        residual * residual.transpose()
+    });
+    Ok(Alignment {
+        T_truth_est,
+        residual: squares.sum::<Matrix6<f64>>() / pairs.T_world_cam_est.len() as f64,
+    })
 }
 
 /// Whether a trajectory carries no rotation: all are the same.
@@ -649,6 +682,58 @@ mod tests {
         let mirror: Vec<_> = path.iter().map(|p| Vector3::new(-p.x, p.y, p.z)).collect();
         let s = umeyama(&path, &mirror, true).unwrap();
         assert!((s.rotation.matrix().determinant() - 1.0).abs() < 1e-12 && s.scale > 0.0);
+    }
+
+    #[test]
+    fn an_alignment_says_what_it_leaves() {
+        let truth = drive(40);
+        let motion = Se3::new(Vector3::new(3.0, -2.0, 1.0), Vector3::new(0.3, -0.2, 1.0));
+        // Every second pose is off by a step and a turn, there and back: the fit stays between.
+        let (step, turn) = (
+            Vector3::new(0.02, -0.01, 0.05),
+            Vector3::new(0.01, 0.0, 0.02),
+        );
+        let moved = truth.poses.iter().enumerate().map(|(i, pose)| {
+            let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+            let mut off = pose.T_world_cam;
+            off.translation.vector += sign * step;
+            off.rotation = UnitQuaternion::from_scaled_axis(sign * turn) * off.rotation;
+            StampedPose {
+                T_world_cam: motion.inverse() * off,
+                ..*pose
+            }
+        });
+        let estimate = Trajectory {
+            poses: moved.collect(),
+        };
+        let found = align(&estimate, &truth, 0.02).unwrap();
+        let off = found.T_truth_est * motion.inverse();
+        assert!(off.translation.vector.norm() < 0.01 && off.rotation.angle() < 0.005);
+        let back = motion.rotation.inverse();
+        let expected: Vec<f64> = (back * step)
+            .iter()
+            .chain((back * turn).iter())
+            .copied()
+            .collect();
+        let expected = Vector6::from_row_slice(&expected);
+        let wanted = expected * expected.transpose();
+        assert!(
+            (found.residual - wanted).norm() < 0.15 * wanted.norm(),
+            "{} {wanted}",
+            found.residual
+        );
+        // Places alone leave no rotation.
+        let places = Trajectory {
+            poses: (truth.poses.iter())
+                .map(|p| StampedPose {
+                    T_world_cam: p.T_world_cam.translation.into(),
+                    ..*p
+                })
+                .collect(),
+        };
+        let found = align(&estimate, &places, 0.02).unwrap();
+        assert_eq!(found.residual.fixed_view::<3, 6>(3, 0).norm(), 0.0);
+        assert!(found.residual[(2, 2)] > 0.0);
     }
 
     #[test]

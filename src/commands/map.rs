@@ -148,7 +148,7 @@ struct Summary {
 
 pub fn run(args: Args, output: &Output) -> Result<()> {
     let slam = SlamRun::open(&args.run)?;
-    let keyframes = chosen(&slam, &args)?;
+    let mut keyframes = chosen(&slam, &args)?;
     let mut config = MapConfig {
         voxel: args.voxel,
         cell: args.cell,
@@ -173,9 +173,14 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
             poses: keyframes.iter().map(|k| k.pose).collect(),
         };
         let reference = read_places(file)?;
-        let motion = align(&run, &reference, DEFAULT_TOLERANCE)
+        let found = align(&run, &reference, DEFAULT_TOLERANCE)
             .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
-        config.levelling = Levelling::Known(motion);
+        config.levelling = Levelling::Known(found.T_truth_est);
+        // The run knows its first key frame without doubt, and the others against that one. What the fit leaves is
+        // what it may be off everywhere.
+        for covariance in keyframes.iter_mut().filter_map(|k| k.covariance.as_mut()) {
+            *covariance += found.residual;
+        }
     }
     let sensor = match noise {
         Some(noise) => noise.sensor(slam.rig.fx, slam.rig.baseline),

@@ -227,7 +227,9 @@ fn planned(args: &Args, given: &[(Row, PathBuf)]) -> Vec<(String, Vec<String>)> 
             .map(str::to_owned)
             .to_vec();
             words.extend(["--threads".into(), args.engine.threads.to_string()]);
-            words.extend(["--outlines".into(), args.engine.outlines.to_string()]);
+            if let Some(passes) = args.engine.outlines {
+                words.extend(["--outlines".into(), passes.to_string()]);
+            }
             if args.unchecked.no_check {
                 words.push("--no-check".into());
             }
@@ -303,7 +305,7 @@ impl Compared {
         let mut motion = Se3::identity();
         if let Some(truth) = truth {
             let found = score(&route, truth, DEFAULT_TOLERANCE)?;
-            motion = align(&route, truth, DEFAULT_TOLERANCE)?;
+            motion = align(&route, truth, DEFAULT_TOLERANCE)?.T_truth_est;
             row.ate = Some(found.ate_rmse);
             row.ate_percent = Some(100.0 * found.ate_rmse / found.length);
             let off = end_error(&route, truth, &motion)?;
