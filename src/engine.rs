@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use barchan_infer::{
     BlockMatching, BurnEngine, Contract, DisparityEngine, OnnxEngine, Outlined, Outlines, Runtime,
-    SecondOpinion, SemiGlobal,
+    SecondOpinion, SemiGlobal, Threaded,
 };
 use barchan_model::{Device, StereoNet, onnx, weights};
 use barchan_train::RunDir;
@@ -19,6 +19,9 @@ const SHIPPED: [(&str, &[u8]); 2] = [
 /// Where no `--model` is given: real time on two cores where ONNX Runtime is installed.
 pub const DEFAULT_MODEL: &str = "rover";
 
+/// What `--outlines` is where pairs come as a stream.
+pub const STREAM_OUTLINES: usize = 1;
+
 /// How engines run; flags that all commands with `--model` share.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct EngineSettings {
@@ -26,9 +29,9 @@ pub struct EngineSettings {
     #[arg(long, default_value_t = 0)]
     pub threads: usize,
     /// How often the outlines of a network's disparity are moved to where the images have them; each time
-    /// by up to ten pixels. 0 leaves the network's answer as it is
-    #[arg(long, default_value_t = Outlines::default().passes, value_name = "PASSES")]
-    pub outlines: usize,
+    /// by up to ten pixels. 0 leaves the network's answer as it is [default: 2; 1 where pairs come as a stream]
+    #[arg(long, value_name = "PASSES")]
+    pub outlines: Option<usize>,
     /// Where else outlines get surfaces from that the network missed: semi-global matching, of the whole images or of
     /// half their size [default: full; half where pairs come as a stream]
     #[arg(long, value_enum, value_name = "SIZE")]
@@ -47,9 +50,20 @@ impl EngineSettings {
     /// These, for pairs that come as a stream: what was not asked for is what is fast.
     pub fn streaming(self) -> Self {
         Self {
+            outlines: self.outlines.or(Some(STREAM_OUTLINES)),
             second_opinion: self.second_opinion.or(Some(OpinionSize::Half)),
             ..self
         }
+    }
+
+    /// These, on threads of their own, so that other work does not wait for them.
+    pub fn beside_other_work(self) -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let threads = match self.threads {
+            0 => cores,
+            threads => threads,
+        };
+        Self { threads, ..self }
     }
 }
 
@@ -92,6 +106,19 @@ pub fn load_engine(
     runtime: Option<&Path>,
     settings: &EngineSettings,
 ) -> Result<Box<dyn DisparityEngine>> {
+    let engine = load_unlimited(model, runtime, settings)?;
+    Ok(match settings.threads {
+        0 => engine,
+        threads => Box::new(Threaded::new(engine, threads)?),
+    })
+}
+
+/// [`load_engine`], where all but ONNX Runtime takes as many threads as there are.
+fn load_unlimited(
+    model: &str,
+    runtime: Option<&Path>,
+    settings: &EngineSettings,
+) -> Result<Box<dyn DisparityEngine>> {
     if let Some(engine) = classical(model)? {
         return Ok(engine);
     }
@@ -102,9 +129,11 @@ pub fn load_engine(
             Some(OpinionSize::Half) => SecondOpinion::Half,
             Some(OpinionSize::None) => SecondOpinion::None,
         };
-        match settings.outlines {
+        let outlines =
+            (settings.outlines).map_or_else(Outlines::default, |passes| Outlines { passes });
+        match outlines.passes {
             0 => engine,
-            passes => Box::new(Outlined::new(engine, Outlines { passes }, opinion)),
+            _ => Box::new(Outlined::new(engine, outlines, opinion)),
         }
     };
     let path = Path::new(model);

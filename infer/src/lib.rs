@@ -24,6 +24,7 @@ mod probe;
 #[cfg(feature = "onnxruntime")]
 mod quantize;
 mod rejection;
+mod threaded;
 
 #[cfg(feature = "burn")]
 pub use burn_engine::BurnEngine;
@@ -40,3 +41,4 @@ pub use probe::{Decision, Verdict, probe};
 #[cfg(feature = "onnxruntime")]
 pub use quantize::{QuantizeError, QuantizeOptions, Quantized, quantize};
 pub use rejection::{Rejection, structural_dissimilarity, warp_right_to_left};
+pub use threaded::Threaded;

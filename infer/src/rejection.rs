@@ -78,40 +78,44 @@ pub fn structural_dissimilarity(a: &Plane, b: &Plane) -> Plane {
     out.par_chunks_mut(w.max(1))
         .enumerate()
         .for_each(|(y, row)| {
-            // Sums over the window's rows, one set per column; the window then slides along x.
-            let columns: Vec<[f32; 6]> = (0..w)
-                .map(|x| {
-                    let mut s = [0.0; 6];
-                    for yy in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(h) {
-                        let (va, vb) = (pa[yy * w + x], pb[yy * w + x]);
-                        if va.is_finite() && vb.is_finite() {
-                            for (sum, term) in
-                                s.iter_mut().zip([1.0, va, vb, va * va, vb * vb, va * vb])
-                            {
-                                *sum += term;
-                            }
-                        }
+            // Sums over the window's rows, one list for each of count, means and products; with room for a window
+            // around the first and the last column. What is unknown counts as nothing.
+            let mut columns: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; w + 2 * RADIUS]);
+            for yy in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(h) {
+                let [n, a, b, aa, bb, ab] = &mut columns;
+                for x in 0..w {
+                    let (va, vb) = (pa[yy * w + x], pb[yy * w + x]);
+                    let known = va.is_finite() && vb.is_finite();
+                    let (va, vb) = if known { (va, vb) } else { (0.0, 0.0) };
+                    let at = x + RADIUS;
+                    n[at] += f32::from(u8::from(known));
+                    a[at] += va;
+                    b[at] += vb;
+                    aa[at] += va * va;
+                    bb[at] += vb * vb;
+                    ab[at] += va * vb;
+                }
+            }
+            let sums = columns.map(|column| {
+                let mut sums = column[..w].to_vec();
+                for k in 1..=2 * RADIUS {
+                    for (sum, value) in sums.iter_mut().zip(&column[k..]) {
+                        *sum += value;
                     }
-                    s
-                })
-                .collect();
-            for x in 0..w {
+                }
+                sums
+            });
+            for (x, out) in row.iter_mut().enumerate() {
                 if !(pa[y * w + x].is_finite() && pb[y * w + x].is_finite()) {
                     continue;
                 }
-                let mut s = [0.0; 6];
-                for column in &columns[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(w)] {
-                    for (sum, term) in s.iter_mut().zip(column) {
-                        *sum += term;
-                    }
-                }
-                let n = s[0];
-                let (ma, mb) = (s[1] / n, s[2] / n);
-                let (va, vb) = ((s[3] / n - ma * ma).max(0.0), (s[4] / n - mb * mb).max(0.0));
-                let cov = s[5] / n - ma * mb;
+                let [n, a, b, aa, bb, ab] = [0, 1, 2, 3, 4, 5].map(|k: usize| sums[k][x]);
+                let (ma, mb) = (a / n, b / n);
+                let (va, vb) = ((aa / n - ma * ma).max(0.0), (bb / n - mb * mb).max(0.0));
+                let cov = ab / n - ma * mb;
                 let ssim = ((2.0 * ma * mb + C1) * (2.0 * cov + C2))
                     / ((ma * ma + mb * mb + C1) * (va + vb + C2));
-                row[x] = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
+                *out = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
             }
         });
     Plane::from_raw(width, height, out).unwrap_or_default()

@@ -20,6 +20,7 @@ mod features;
 mod frame;
 mod fusion;
 mod icp_odometry;
+mod lanes;
 mod local_map;
 mod loops;
 mod map;

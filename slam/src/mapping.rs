@@ -21,9 +21,8 @@ use crate::pose::Observation;
 use crate::tracker::Placement;
 use crate::{SlamConfig, SlamError};
 
-/// What a key frame came to, once it is in the map.
+/// What a key frame came to, once it is in the map with all that its dense disparity says.
 #[derive(Clone, Debug, Serialize)]
-#[allow(non_snake_case)]
 pub struct Mapped {
     /// Index of the frame in the sequence.
     pub frame: usize,
@@ -43,9 +42,6 @@ pub struct Mapped {
     /// Dense disparity after rejection, when there is an engine. Not serialised.
     #[serde(skip)]
     pub dense: Option<DisparityMap>,
-    /// Where the world went under the key frame: see `Tracker::map_moved`.
-    #[serde(skip)]
-    pub(crate) T_old_new: Se3,
 }
 
 /// A frame that is to become a key frame.
@@ -59,11 +55,43 @@ pub(crate) struct Candidate {
     pub way: Option<Way>,
 }
 
+/// What adding a key frame, or the disparity of one, came to.
+#[allow(non_snake_case)]
+pub(crate) struct Settled {
+    /// The key frame that is through, if one is.
+    pub mapped: Option<Mapped>,
+    /// Where the world went under the newest key frame: see `Tracker::map_moved`.
+    pub T_old_new: Se3,
+}
+
+/// A key frame that is in the map by its sparse matches, while its dense disparity is computed.
+struct Pending {
+    frame: StereoFrame,
+    seen: Seen,
+    way: Option<Way>,
+    dense: JoinHandle<Disparity>,
+    ms_map: f64,
+}
+
+/// Dense disparity less what the pair itself contradicts, and the milliseconds it took; nothing without an engine,
+/// which comes along.
+struct Disparity {
+    engine: Option<Box<dyn DisparityEngine>>,
+    dense: Result<Option<DisparityMap>, SlamError>,
+    ms: f64,
+}
+
 /// Makes the map: key frames in, one by one.
+///
+/// A key frame comes in by its sparse matches at once, so that what follows is tracked against it. Its dense disparity
+/// takes longer: what it says of these matches is heard before the next key frame comes in, and then loops are looked
+/// for.
 pub(crate) struct Mapper {
     rig: RectifiedRig,
     config: SlamConfig,
+    /// `None` while it works, and when there is none.
     engine: Option<Box<dyn DisparityEngine>>,
+    pending: Option<Pending>,
     pub map: Map,
     pub loops: Option<LoopCloser>,
 }
@@ -79,75 +107,124 @@ impl Mapper {
             rig,
             config,
             engine,
+            pending: None,
             map: Map::default(),
             loops,
         }
     }
 
-    /// Adds a key frame to the map: dense disparity, stereo matches gated by it (Hong 2021, 3.2.3);
-    /// sightings of known points, new points from the other stereo features, local bundle adjustment
-    /// over the key frames around it, culling; loops.
+    /// Adds a key frame to the map: sightings of known points, new points from the other stereo features, local
+    /// bundle adjustment over the key frames around it, culling. Before that, what is left of the one before:
+    /// [`Mapper::complete`].
     #[allow(non_snake_case)]
-    fn add(&mut self, candidate: Candidate) -> Result<Mapped, SlamError> {
+    fn add(&mut self, candidate: Candidate) -> Result<Settled, SlamError> {
         let Candidate {
             frame,
-            mut seen,
-            placement,
+            seen,
+            mut placement,
             submap,
             way,
         } = candidate;
-        let started = Instant::now();
-        let dense = self.dense_disparity(&frame)?;
-        let ms_disparity = dense.as_ref().map_or(0.0, |_| ms_since(started));
+        let T_cam_world = placement.T_cam_world;
+        let Settled { mapped, T_old_new } = self.complete()?;
+        placement.T_cam_world *= T_old_new;
+        let dense = self.begin_disparity(&frame);
 
         let started = Instant::now();
-        if let Some(dense) = dense.as_ref().filter(|_| self.config.gate) {
-            let gate = DisparityGate {
-                disparity: &dense.disparity,
-                threshold: self.config.gate_px,
-            };
-            seen.match_stereo(&self.rig, Some(&gate), &self.config);
-        }
         let (map, rig, config) = (&mut self.map, &self.rig, &self.config);
         let keyframe = add_keyframe(map, &frame, &seen, &placement, submap);
         add_new_points(map, keyframe, &frame.left, &seen, rig, config);
         let local = map.around(keyframe, config.window);
         adjust(map, &local, rig, config);
         cull(map, keyframe);
+        let mut T_old_new = T_cam_world.inv_mul(&map.keyframes[keyframe].T_cam_world);
+        T_old_new.rotation.renormalize();
+        self.pending = Some(Pending {
+            frame,
+            seen,
+            way,
+            dense,
+            ms_map: ms_since(started),
+        });
+        Ok(Settled { mapped, T_old_new })
+    }
+
+    /// Waits for the dense disparity of the newest key frame: stereo matches gated by it (Hong 2021, 3.2.3), loops
+    /// proved by it.
+    #[allow(non_snake_case)]
+    fn complete(&mut self) -> Result<Settled, SlamError> {
+        let Some(pending) = self.pending.take() else {
+            return Ok(Settled {
+                mapped: None,
+                T_old_new: Se3::identity(),
+            });
+        };
+        let Pending {
+            frame,
+            mut seen,
+            way,
+            dense,
+            ms_map,
+        } = pending;
+        let Disparity { engine, dense, ms } = joined(dense);
+        self.engine = engine;
+        let dense = dense?;
+
+        let started = Instant::now();
+        let (map, rig, config) = (&mut self.map, &self.rig, &self.config);
+        let keyframe = map.keyframes.len() - 1;
+        if let Some(dense) = dense.as_ref().filter(|_| config.gate) {
+            let gate = DisparityGate {
+                disparity: &dense.disparity,
+                threshold: config.gate_px,
+            };
+            seen.match_stereo(rig, Some(&gate), config);
+            forget_changed_matches(map, keyframe, &seen);
+            add_new_points(map, keyframe, &frame.left, &seen, rig, config);
+        }
+        let before = map.keyframes[keyframe].T_cam_world;
         let dense_disparity = dense.as_ref().map(|d| &d.disparity);
         let loops = (self.loops.as_mut()).map(|closer| closer.close(map, dense_disparity, way));
-        let mut T_old_new = placement
-            .T_cam_world
-            .inv_mul(&map.keyframes[keyframe].T_cam_world);
+        let mut T_old_new = before.inv_mul(&map.keyframes[keyframe].T_cam_world);
         T_old_new.rotation.renormalize();
-        Ok(Mapped {
+        let mapped = Mapped {
             frame: frame.index,
             name: frame.name,
             matches: seen.matches,
             loops: loops.unwrap_or_default(),
-            ms_disparity,
-            ms_map: ms_since(started),
+            ms_disparity: ms,
+            ms_map: ms_map + ms_since(started),
             left: frame.left,
             dense,
+        };
+        Ok(Settled {
+            mapped: Some(mapped),
             T_old_new,
         })
     }
 
-    /// Dense disparity less what the pair itself contradicts; `None` without an engine.
-    fn dense_disparity(&mut self, frame: &StereoFrame) -> Result<Option<DisparityMap>, SlamError> {
-        let Some(engine) = &mut self.engine else {
-            return Ok(None);
-        };
-        let dense = engine.disparity(&frame.left, &frame.right);
-        let mut dense = dense.map_err(|source| SlamError::Disparity {
-            frame: frame.name.clone(),
-            source,
-        })?;
+    /// Dense disparity in a thread of its own, where there is an engine.
+    fn begin_disparity(&mut self, frame: &StereoFrame) -> JoinHandle<Disparity> {
+        let mut engine = self.engine.take();
         let rejection = Rejection {
             max_dissimilarity: self.config.max_dissimilarity,
         };
-        rejection.apply(&frame.left, &frame.right, &mut dense);
-        Ok(Some(dense))
+        let frame = engine.as_ref().map(|_| frame.clone());
+        std::thread::spawn(move || {
+            let started = Instant::now();
+            let dense = engine.as_mut().zip(frame).map(|(engine, frame)| {
+                let dense = engine.disparity(&frame.left, &frame.right);
+                let mut dense = dense.map_err(|source| SlamError::Disparity {
+                    frame: frame.name.clone(),
+                    source,
+                })?;
+                rejection.apply(&frame.left, &frame.right, &mut dense);
+                Ok(dense)
+            });
+            let ms = dense.as_ref().map_or(0.0, |_| ms_since(started));
+            let dense = dense.transpose();
+            Disparity { engine, dense, ms }
+        })
     }
 }
 
@@ -155,10 +232,15 @@ fn ms_since(started: Instant) -> f64 {
     started.elapsed().as_secs_f64() * 1e3
 }
 
+/// What a thread ends with. What panics there has to be heard of here.
+fn joined<T>(thread: JoinHandle<T>) -> T {
+    (thread.join()).unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+}
+
 /// The map, and the thread that at times works on it while frames are tracked (Pire 2017).
 pub(crate) struct Mapping {
     mapper: Arc<Mutex<Mapper>>,
-    work: Option<JoinHandle<Result<Mapped, SlamError>>>,
+    work: Option<JoinHandle<Result<Settled, SlamError>>>,
 }
 
 impl Mapping {
@@ -189,12 +271,14 @@ impl Mapping {
         }));
     }
 
-    /// Waits until the key frame in hand, if there is one, is in the map.
-    pub fn settle(&mut self) -> Result<Option<Mapped>, SlamError> {
-        let joined = self.work.take().map(JoinHandle::join);
-        // What panics there has to be heard of here.
-        let result = joined.map(|r| r.unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
-        result.transpose()
+    /// Waits until the key frame in hand, if there is one, is in the map. The one before it then is through.
+    pub fn settle(&mut self) -> Result<Option<Settled>, SlamError> {
+        self.work.take().map(joined).transpose()
+    }
+
+    /// Waits for the dense disparity of the newest key frame, if one is awaited. Nothing may be in hand.
+    pub fn complete(&mut self) -> Result<Settled, SlamError> {
+        self.mapper().complete()
     }
 }
 
@@ -222,10 +306,27 @@ fn add_keyframe(
         disparities: seen.disparities.clone(),
         proof_disparities: seen.disparities.clone(),
     });
+    // Points that dense disparity refused meanwhile, or that a loop made one with others, are not observed.
     for sighting in &placement.sightings {
         map.observe(keyframe, sighting.feature, sighting.point);
     }
     keyframe
+}
+
+/// The newest key frame takes over stereo matches that were decided anew. Points that it made of others are no more;
+/// of points that were known before, it keeps what the left image sees.
+fn forget_changed_matches(map: &mut Map, keyframe: usize, seen: &Seen) {
+    for (feature, disparity) in seen.disparities.iter().enumerate() {
+        let frame = &mut map.keyframes[keyframe];
+        if frame.disparities[feature] == *disparity {
+            continue;
+        }
+        frame.disparities[feature] = *disparity;
+        let point = frame.points[feature];
+        if let Some(id) = point.filter(|id| map.points[id].observations.len() == 1) {
+            map.remove(id);
+        }
+    }
 }
 
 /// Features with a disparity that see no known point make new ones.

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::features::{Descriptor, Features};
+use crate::lanes::{dot, sum};
 use crate::map::{MapPoint, PointId};
 use crate::{Keypoint, SlamConfig};
 
@@ -194,21 +195,17 @@ impl Window {
             let start = ((v + dy) * width + u - Self::RADIUS) as usize;
             row.copy_from_slice(&image.as_raw()[start..start + Self::SIDE]);
         }
-        let mean = values.iter().sum::<f32>() / values.len() as f32;
+        let mean = sum(&values) / values.len() as f32;
         values.iter_mut().for_each(|value| *value -= mean);
-        let energy = product(&values, &values);
+        let energy = dot(&values, &values);
         Some(Self { values, energy })
     }
 
     /// How alike two windows are, whatever their brightness and contrast: 1 for the same.
     pub fn correlation(&self, other: &Self) -> f32 {
         let norm = (self.energy * other.energy).sqrt().max(1e-9);
-        product(&self.values, &other.values) / norm
+        dot(&self.values, &other.values) / norm
     }
-}
-
-fn product(a: &[f32], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Zero-mean correlation of a window along the row around the coarse match, and a parabola through its

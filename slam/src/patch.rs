@@ -3,6 +3,8 @@
 use barchan_datasets::Plane;
 use nalgebra::{Matrix2, Vector2};
 
+use crate::lanes::{dot, sum};
+
 /// Half the side of a patch, samples; its outermost ring only serves the gradient.
 const RADIUS: i32 = 5;
 const SIDE: usize = 2 * RADIUS as usize + 1;
@@ -43,7 +45,7 @@ impl Patch {
 
     /// Cuts a patch around a place of an image; `None` where it would leave the image.
     pub fn cut(image: &Plane, at: Vector2<f64>, spacing: f64, depth: f64) -> Option<Self> {
-        let samples = sample::<{ SIDE * SIDE }>(image, at, spacing, RADIUS)?;
+        let samples = sample::<{ SIDE * SIDE }, SIDE>(image, at, spacing)?;
         Some(Self {
             samples,
             spacing: spacing as f32,
@@ -59,40 +61,36 @@ impl Patch {
         const LIKENESS: f32 = 0.85;
         let spacing = f64::from(self.spacing) * f64::from(self.depth) / depth;
         let mut reference = [0.0f32; INNER * INNER];
-        let mut gradient = [Vector2::<f32>::zeros(); INNER * INNER];
+        let [mut along, mut down] = [[0.0f32; INNER * INNER]; 2];
         for y in 0..INNER {
             for x in 0..INNER {
-                let at = (y + 1) * SIDE + x + 1;
-                reference[y * INNER + x] = self.samples[at];
-                let (dx, dy) = (
-                    self.samples[at + 1] - self.samples[at - 1],
-                    self.samples[at + SIDE] - self.samples[at - SIDE],
-                );
-                gradient[y * INNER + x] = 0.5 * Vector2::new(dx, dy);
+                let (at, inner) = ((y + 1) * SIDE + x + 1, y * INNER + x);
+                reference[inner] = self.samples[at];
+                along[inner] = 0.5 * (self.samples[at + 1] - self.samples[at - 1]);
+                down[inner] = 0.5 * (self.samples[at + SIDE] - self.samples[at - SIDE]);
             }
         }
         let contrast = normalise(&mut reference)?;
-        gradient.iter_mut().for_each(|g| *g /= contrast);
-        let hessian: Matrix2<f32> = gradient.iter().map(|g| g * g.transpose()).sum();
+        for gradient in [&mut along, &mut down] {
+            gradient.iter_mut().for_each(|g| *g /= contrast);
+        }
+        let mixed = dot(&along, &down);
+        let hessian = Matrix2::new(dot(&along, &along), mixed, mixed, dot(&down, &down));
         let inverse = hessian.try_inverse()?;
 
         let mut at = guess;
         for _ in 0..10 {
-            let mut seen = sample::<{ INNER * INNER }>(image, at, spacing, RADIUS - 1)?;
+            let mut seen = sample::<{ INNER * INNER }, INNER>(image, at, spacing)?;
             normalise(&mut seen)?;
-            let pull: Vector2<f32> = gradient
-                .iter()
-                .zip(reference.iter().zip(&seen))
-                .map(|(g, (r, s))| g * (r - s))
-                .sum();
+            let error: [f32; INNER * INNER] = std::array::from_fn(|k| reference[k] - seen[k]);
+            let pull = Vector2::new(dot(&along, &error), dot(&down, &error));
             let step = (inverse * pull).cast::<f64>() * spacing;
             at += step;
             if (at - guess).norm() > 2.5 * spacing.max(1.0) {
                 return None;
             }
             if step.norm() < 0.01 * spacing {
-                let likeness: f32 = reference.iter().zip(&seen).map(|(r, s)| r * s).sum();
-                return (likeness > LIKENESS).then_some(at);
+                return (dot(&reference, &seen) > LIKENESS).then_some(at);
             }
         }
         None
@@ -101,9 +99,9 @@ impl Patch {
 
 /// Takes the mean out and divides by the norm, which is returned; `None` for a blank.
 fn normalise(samples: &mut [f32]) -> Option<f32> {
-    let mean = samples.iter().sum::<f32>() / samples.len() as f32;
+    let mean = sum(samples) / samples.len() as f32;
     samples.iter_mut().for_each(|s| *s -= mean);
-    let norm = samples.iter().map(|s| s * s).sum::<f32>().sqrt();
+    let norm = dot(samples, samples).sqrt();
     if norm < 1e-3 {
         return None;
     }
@@ -111,34 +109,37 @@ fn normalise(samples: &mut [f32]) -> Option<f32> {
     Some(norm)
 }
 
-/// A square of samples around a place, linearly between pixels; `None` where it leaves the image.
-fn sample<const N: usize>(
+/// A square of `SIDE` x `SIDE` samples around a place, linearly between pixels; `None` where it leaves the image.
+fn sample<const N: usize, const SIDE: usize>(
     image: &Plane,
     at: Vector2<f64>,
     spacing: f64,
-    radius: i32,
 ) -> Option<[f32; N]> {
-    let reach = spacing * f64::from(radius);
+    let radius = (SIDE / 2) as f64;
+    let reach = spacing * radius;
     let (width, height) = (image.width() as usize, image.height() as usize);
     let inside = |x: f64, size: usize| x - reach >= 0.0 && x + reach + 1.0 < size as f64;
     if !(inside(at.x, width) && inside(at.y, height)) {
         return None;
     }
-    let pixels = image.as_raw();
-    let side = 2 * radius + 1;
-    Some(std::array::from_fn(|k| {
-        let (dx, dy) = (k as i32 % side - radius, k as i32 / side - radius);
-        let (x, y) = (
-            at.x + spacing * f64::from(dx),
-            at.y + spacing * f64::from(dy),
-        );
-        let (x0, y0) = (x as usize, y as usize);
-        let (a, b) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
-        let row = &pixels[y0 * width + x0..];
-        let top = row[0] + a * (row[1] - row[0]);
-        let bottom = row[width] + a * (row[width + 1] - row[width]);
-        top + b * (bottom - top)
-    }))
+    // Whole pixel and fraction of each column, and of each row.
+    let split = |centre: f64| -> [(usize, f32); SIDE] {
+        std::array::from_fn(|k| {
+            let x = centre + spacing * (k as f64 - radius);
+            (x as usize, x.fract() as f32)
+        })
+    };
+    let (columns, pixels) = (split(at.x), image.as_raw());
+    let mut samples = [0.0; N];
+    for (samples, (y, b)) in samples.chunks_exact_mut(SIDE).zip(split(at.y)) {
+        let (upper, lower) = (&pixels[y * width..][..width], &pixels[(y + 1) * width..]);
+        for (sample, (x, a)) in samples.iter_mut().zip(columns) {
+            let top = upper[x] + a * (upper[x + 1] - upper[x]);
+            let bottom = lower[x] + a * (lower[x + 1] - lower[x]);
+            *sample = top + b * (bottom - top);
+        }
+    }
+    Some(samples)
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use crate::fusion::{Fusion, FusionCounts, MotionPrior};
 use crate::local_map::LocalMap;
 use crate::loops::{LoopCloser, Way};
 use crate::map::{Keyframe, Map};
-use crate::mapping::{Candidate, Mapped, Mapper, Mapping, adjust_all};
+use crate::mapping::{Candidate, Mapped, Mapper, Mapping, Settled, adjust_all};
 use crate::tracker::{Placement, Tracker};
 use crate::uncertainty::pose_covariances;
 use crate::vocabulary::Vocabulary;
@@ -44,9 +44,9 @@ pub struct FrameReport {
     pub keyframe: bool,
     /// Milliseconds from images to pose, with what it waited for the map.
     pub ms_track: f64,
-    /// The key frame that came into the map meanwhile: this one, or one before. Not serialised.
+    /// Key frames that are through meanwhile: this one, or ones before. Not serialised.
     #[serde(skip)]
-    pub mapped: Option<Mapped>,
+    pub mapped: Vec<Mapped>,
 }
 
 /// What is left when all frames are through.
@@ -92,7 +92,8 @@ struct Prediction {
 ///
 /// A key frame comes into the map in a thread of its own, while the next
 /// [`SlamConfig::map_lag`] frames are tracked in the map as it was; then, or when that does not do, it is
-/// waited for. So what a frame is tracked against depends on the images and not on the clock.
+/// waited for. What its dense disparity says comes into the map before the next key frame. So what a frame is tracked
+/// against depends on the images and not on the clock.
 pub struct Slam {
     rig: RectifiedRig,
     config: SlamConfig,
@@ -207,18 +208,18 @@ impl Slam {
             carried: false,
             keyframe: false,
             ms_track: 0.0,
-            mapped: None,
+            mapped: Vec::new(),
         };
         let mappable = seen.mappable_count(&self.rig, &self.config);
         let enough_stereo = report.stereo >= self.config.min_inliers;
         if self.since_keyframe >= self.config.map_lag {
-            report.mapped = self.settle()?;
+            report.mapped.extend(self.settle_map()?);
         }
         let mut prediction = self.predict(frame.time);
         let mut placement = self.place_near(&seen, &prediction);
         let does = |p: &Placement| !self.runs_low(p.sightings.len(), mappable);
         if self.mapping.is_busy() && !placement.as_ref().is_some_and(does) {
-            report.mapped = self.settle()?;
+            report.mapped.extend(self.settle_map()?);
             prediction = self.predict(frame.time);
             placement = self.place_near(&seen, &prediction);
         }
@@ -288,25 +289,37 @@ impl Slam {
         Ok(report)
     }
 
-    /// Waits until the key frame in hand, if there is one, is in the map; tracking goes on in what is
-    /// around it. To be called after the last frame.
+    /// Waits until all key frames are in the map with what their dense disparity says; tracking goes on in what is
+    /// around the newest. To be called after the last frame.
     ///
     /// # Errors
     /// When the engine fails.
+    pub fn settle(&mut self) -> Result<Vec<Mapped>, SlamError> {
+        let before = self.settle_map()?;
+        let newest = self.mapping.complete()?;
+        let newest = self.follow(newest);
+        Ok(before.into_iter().chain(newest).collect())
+    }
+
+    /// Waits until the key frame in hand, if there is one, is in the map; the one before it is through then.
+    fn settle_map(&mut self) -> Result<Option<Mapped>, SlamError> {
+        let settled = self.mapping.settle()?;
+        Ok(settled.and_then(|settled| self.follow(settled)))
+    }
+
+    /// Follows a map that changed.
     #[allow(non_snake_case)]
-    pub fn settle(&mut self) -> Result<Option<Mapped>, SlamError> {
-        let mapped = self.mapping.settle()?;
-        if let Some(mapped) = &mapped {
-            self.local = self.newest_local_map();
-            self.tracker.map_moved(&mapped.T_old_new);
-            if let Some(prior) = &mut self.prior {
-                prior.map_moved(&mapped.T_old_new);
-            }
-            if let Some(latest) = &mut self.latest {
-                latest.T_world_cam = mapped.T_old_new.inverse() * latest.T_world_cam;
-            }
+    fn follow(&mut self, settled: Settled) -> Option<Mapped> {
+        let Settled { mapped, T_old_new } = settled;
+        self.local = self.newest_local_map();
+        self.tracker.map_moved(&T_old_new);
+        if let Some(prior) = &mut self.prior {
+            prior.map_moved(&T_old_new);
         }
-        Ok(mapped)
+        if let Some(latest) = &mut self.latest {
+            latest.T_world_cam = T_old_new.inverse() * latest.T_world_cam;
+        }
+        mapped
     }
 
     /// Time and pose of the newest frame as they are known now; of a lost one, as predicted. `None` before
@@ -316,11 +329,11 @@ impl Slam {
     }
 
     /// Every frame through: poses of all frames, following their corrected key frames. What
-    /// [`Slam::settle`] would say of a last key frame is not heard.
+    /// [`Slam::settle`] would say of the last key frames is not heard.
     #[allow(non_snake_case)]
     pub fn finish(mut self) -> SlamResult {
-        // A key frame that failed is not in the map.
-        let _ = self.mapping.settle();
+        // What failed is not in the map.
+        let _ = self.settle();
         let mut mapper = self.mapping.mapper();
         let mut map = std::mem::take(&mut mapper.map);
         if self.config.adjust_all {
@@ -475,7 +488,7 @@ impl Slam {
     ) -> Result<(), SlamError> {
         if self.mapping.is_busy() {
             // The pose is a guess: it was placed, but other sensors contradict.
-            report.mapped = self.settle()?;
+            report.mapped.extend(self.settle_map()?);
         }
         report.keyframe = true;
         self.most_inliers = report.inliers;
@@ -497,7 +510,7 @@ impl Slam {
             way,
         });
         if self.config.map_lag == 0 {
-            report.mapped = self.settle()?;
+            report.mapped.extend(self.settle()?);
         }
         Ok(())
     }

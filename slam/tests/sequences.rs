@@ -22,9 +22,9 @@ fn track(
     frames: impl Iterator<Item = StereoFrame>,
 ) -> (Vec<FrameReport>, SlamResult) {
     let mut reports: Vec<FrameReport> = frames.map(|f| slam.track(f).unwrap()).collect();
-    if let (Some(last), Some(mapped)) = (reports.last_mut(), slam.settle().unwrap()) {
-        assert!(last.mapped.is_none());
-        last.mapped = Some(mapped);
+    let mapped = slam.settle().unwrap();
+    if let Some(last) = reports.last_mut() {
+        last.mapped.extend(mapped);
     }
     for lost in reports.iter().filter(|r| !r.tracked) {
         println!("{}: {}", lost.name, lost.reason);
@@ -41,7 +41,7 @@ fn tracked(reports: &[FrameReport]) -> usize {
 }
 
 fn loop_events(reports: &[FrameReport]) -> Vec<LoopEvent> {
-    let mapped = reports.iter().filter_map(|r| r.mapped.as_ref());
+    let mapped = reports.iter().flat_map(|r| &r.mapped);
     mapped.flat_map(|m| m.loops.clone()).collect()
 }
 
@@ -93,7 +93,7 @@ fn a_real_rover_with_dense_disparity_as_a_witness() {
     assert!(score.ate_rmse_sim3 <= 0.06, "{score:?}");
     // Dense disparity at key frames, nowhere else; each rule decides something.
     let keyframes = reports.iter().filter(|r| r.keyframe).map(|r| r.frame);
-    let mapped: Vec<&Mapped> = reports.iter().filter_map(|r| r.mapped.as_ref()).collect();
+    let mapped: Vec<&Mapped> = reports.iter().flat_map(|r| &r.mapped).collect();
     assert!(keyframes.eq(mapped.iter().map(|m| m.frame)));
     assert!(mapped.iter().all(|m| m.dense.is_some()));
     let sum = |f: fn(&MatchCounts) -> usize| mapped.iter().map(|m| f(&m.matches)).sum::<usize>();

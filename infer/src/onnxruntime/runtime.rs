@@ -135,8 +135,8 @@ pub(crate) fn open_bytes(
         .map_err(|e| failed(e.to_string()))?
         .with_intra_threads(threads)
         .map_err(|e| failed(e.to_string()))?
-        // Its threads wait busily for work within a run; after it they would take the cores from us.
-        .with_config_entry("session.force_spinning_stop", "1")
+        // Its threads would wait busily for work, and take the cores from us.
+        .with_config_entry("session.intra_op.allow_spinning", "0")
         .map_err(|e| failed(e.to_string()))?
         // What fails is returned; the runtime need not print it too.
         .with_log_level(LogLevel::Fatal)

@@ -86,7 +86,7 @@ pub struct Args {
     /// Threads that work on one image; 0 leaves it to the engine
     #[arg(long)]
     threads: Option<usize>,
-    /// How often the outlines of a network's disparity are moved to where the images have them [default: 2]
+    /// How often the outlines of a network's disparity are moved to where the images have them [default: 1]
     #[arg(long, value_name = "PASSES")]
     outlines: Option<usize>,
     /// Edge of a voxel of the map, metres [default: 0.02]
@@ -138,7 +138,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
     })?;
     let engines = EngineSettings {
         threads: settings.threads,
-        outlines: settings.outlines,
+        outlines: Some(settings.outlines),
         second_opinion: None,
     }
     .streaming();

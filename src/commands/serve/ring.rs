@@ -136,7 +136,7 @@ impl Run {
     pub fn add(&mut self, report: &FrameReport) -> Result<()> {
         self.summary.frames += 1;
         self.summary.tracked += usize::from(report.tracked);
-        if let Some(mapped) = &report.mapped {
+        for mapped in &report.mapped {
             self.summary.loops += mapped.loops.iter().filter(|l| l.proved).count();
             if let Some(dense) = &mapped.dense {
                 write_dense(&self.out, mapped.frame, &mapped.left, dense)?;

@@ -4,11 +4,11 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use barchan_infer::Outlines;
 use barchan_slam::SlamConfig;
 use serde::{Deserialize, Serialize};
 
 use crate::engine::DEFAULT_MODEL;
+use crate::engine::STREAM_OUTLINES;
 
 /// Everything that decides how the service runs: the TOML file. Paths in it start at its folder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,7 +72,7 @@ impl Default for Settings {
             keep_answers: 16,
             track: true,
             threads: 0,
-            outlines: Outlines::default().passes,
+            outlines: STREAM_OUTLINES,
             voxel: 0.02,
             cell: 0.05,
             slam: SlamConfig::default(),

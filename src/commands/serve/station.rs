@@ -314,7 +314,7 @@ impl Tracking {
         *locked(&self.handed) = Some(dense);
         let report = self.slam.track(frame)?;
         let pose = self.slam.pose().map(|p| p.T_world_cam);
-        let mapped = report.mapped.as_ref();
+        let mapped = report.mapped.last();
         let dense = mapped.and_then(|m| Some((&m.left, m.dense.as_ref()?)));
         if let (Some((left, dense)), Some(pose)) = (dense, pose) {
             let limits = DepthLimits::default();

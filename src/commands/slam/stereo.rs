@@ -61,7 +61,9 @@ pub fn run(
     let reckoning = (args.dead_reckoning)
         .map(|form| Reckoning::new(source.sensors(), form, &config.fusion, &args.data))
         .transpose()?;
-    let engine = load_engine(&args.model, runtime, &args.engine.streaming())?;
+    // Frames are tracked meanwhile.
+    let engines = args.engine.streaming().beside_other_work();
+    let engine = load_engine(&args.model, runtime, &engines)?;
     out.write("config.toml", toml::to_string(&config)?)?;
     let mut log = RunLog::create(&out)?;
 
@@ -92,7 +94,7 @@ pub fn run(
             };
             output.notice(&format!("frame {} {what}: {}", report.name, report.reason));
         }
-        if let Some(mapped) = report.mapped.take() {
+        for mapped in report.mapped.drain(..) {
             map.add(mapped, &out, output)?;
         }
         if let Some(place) = report.found_again_at {
@@ -108,7 +110,7 @@ pub fn run(
         log.add(&report)?;
         bar.inc(1);
     }
-    if let Some(mapped) = slam.settle()? {
+    for mapped in slam.settle()? {
         map.add(mapped, &out, output)?;
     }
     let seconds = started.elapsed().as_secs_f64();
