@@ -105,17 +105,21 @@ pub fn structural_dissimilarity(a: &Plane, b: &Plane) -> Plane {
                 }
                 sums
             });
+            let [n, a, b, aa, bb, ab] = sums.each_ref().map(|sums| &sums[..w]);
             for (x, out) in row.iter_mut().enumerate() {
-                if !(pa[y * w + x].is_finite() && pb[y * w + x].is_finite()) {
-                    continue;
-                }
-                let [n, a, b, aa, bb, ab] = [0, 1, 2, 3, 4, 5].map(|k: usize| sums[k][x]);
-                let (ma, mb) = (a / n, b / n);
-                let (va, vb) = ((aa / n - ma * ma).max(0.0), (bb / n - mb * mb).max(0.0));
-                let cov = ab / n - ma * mb;
+                let (ma, mb) = (a[x] / n[x], b[x] / n[x]);
+                let va = (aa[x] / n[x] - ma * ma).max(0.0);
+                let vb = (bb[x] / n[x] - mb * mb).max(0.0);
+                let cov = ab[x] / n[x] - ma * mb;
                 let ssim = ((2.0 * ma * mb + C1) * (2.0 * cov + C2))
                     / ((ma * ma + mb * mb + C1) * (va + vb + C2));
                 *out = ((1.0 - ssim) / 2.0).clamp(0.0, 1.0);
+            }
+            let centres = pa[y * w..].iter().zip(&pb[y * w..]);
+            for (out, (a, b)) in row.iter_mut().zip(centres) {
+                if !(a.is_finite() && b.is_finite()) {
+                    *out = f32::NAN;
+                }
             }
         });
     Plane::from_raw(width, height, out).unwrap_or_default()

@@ -363,16 +363,29 @@ impl LoopCloser {
         };
         let mut edges = Vec::new();
         for k in 1..=newest {
-            let shared = map
-                .shared_with(k)
-                .into_iter()
-                .filter(|(other, _)| *other < k);
+            let shared = map.shared_with(k).into_iter();
+            let earlier = shared.filter(|(other, _)| *other < k).enumerate();
             // The first shares most.
-            for (place, (other, count)) in shared.enumerate() {
-                if place == 0 || other + 1 == k || count >= COVISIBLE {
-                    let (translation, rotation) = NEIGHBOUR_SIGMA;
-                    edges.push(tie(other, k, (scale * translation, rotation)));
-                }
+            let ties: Vec<usize> = earlier
+                .filter(|(place, (other, count))| {
+                    *place == 0 || other + 1 == k || *count >= COVISIBLE
+                })
+                .map(|(_, (other, _))| other)
+                .collect();
+            let counted = (ties.len() as f64).sqrt();
+            for other in ties {
+                // Ties of one key frame tell of the same steps: together they count as one tie to the one before.
+                let steps = match k - other {
+                    steps if steps < self.config.loops.min_gap => steps as f64,
+                    _ => 1.0,
+                };
+                let (translation, rotation) = NEIGHBOUR_SIGMA;
+                let shares = steps * counted;
+                edges.push(tie(
+                    other,
+                    k,
+                    (shares * scale * translation, shares * rotation),
+                ));
             }
             if edges.last().is_none_or(|e| e.b != k) {
                 let sigma = map.keyframes[k].carried.unwrap_or(GUESS_SIGMA);
@@ -488,6 +501,9 @@ fn connected(map: &Map, keyframe: usize) -> BTreeSet<usize> {
 
 #[cfg(test)]
 mod tests {
+    use barchan_geometry::se3;
+    use nalgebra::Vector6;
+
     use super::*;
     use crate::features::Features;
 
@@ -562,6 +578,76 @@ mod tests {
         merge(&mut map, other, 2, 1);
         assert_consistent(&map);
         assert_eq!(map.points[&other].observations, [(0, 1), (2, 1)]);
+    }
+
+    /// Key frames of a drive, each of which sees the same points as the five before it.
+    fn drive(poses: &[Se3]) -> Map {
+        const NEW: usize = 50;
+        const SEEN: usize = 6;
+        let mut map = map(poses.len());
+        for (keyframe, pose) in map.keyframes.iter_mut().zip(poses) {
+            keyframe.T_cam_world = *pose;
+            keyframe.features.keypoints = vec![keyframe.features.keypoints[0]; NEW * SEEN];
+            keyframe.features.descriptors = vec![keyframe.features.descriptors[0]; NEW * SEEN];
+            keyframe.points = vec![None; NEW * SEEN];
+        }
+        for k in 0..poses.len() {
+            for n in 0..NEW {
+                let slot = |k: usize| k % SEEN * NEW + n;
+                let id = map.add_point(k, slot(k), Point3::origin(), [0; 3], None);
+                for later in k + 1..(k + SEEN).min(poses.len()) {
+                    map.observe(later, slot(k), id);
+                }
+            }
+        }
+        map
+    }
+
+    #[test]
+    fn a_loop_takes_out_a_drift_that_many_ties_agree_on() {
+        const KEYFRAMES: usize = 300;
+        let poses = |yaw: f64| -> Vec<Se3> {
+            let step = se3::exp(&Vector6::new(0.0, 0.0, -0.2, 0.0, yaw, 0.0));
+            std::iter::successors(Some(Se3::identity()), |pose| Some(step * pose))
+                .take(KEYFRAMES)
+                .collect()
+        };
+        // The heading drifts by an eighth of a degree in ten steps, well within what a step may be off.
+        let (truth, estimate) = (poses(0.0), poses(2e-4));
+        let mut map = drive(&estimate);
+        let rig = RectifiedRig {
+            fx: 300.0,
+            fy: 300.0,
+            cx: 192.0,
+            cy: 144.0,
+            baseline: 0.12,
+            doffs: 0.0,
+            width: 384,
+            height: 288,
+        };
+        let config = SlamConfig::default();
+        let words = Vocabulary::shipped(config.detector);
+        let mut closer = LoopCloser::new(rig, config, words);
+        let newest = KEYFRAMES - 1;
+        let found = Found {
+            T_cam_world: truth[newest],
+            pairs: Vec::new(),
+        };
+        let off = |map: &Map, k: usize| {
+            (map.keyframes[k].T_cam_world * truth[k].inverse())
+                .translation
+                .vector
+                .norm()
+        };
+        let before = off(&map, newest);
+        closer.correct(&mut map, newest, 0, &found);
+        let after = off(&map, newest);
+        assert!(
+            before > 1.5 && after < 0.05 * before,
+            "{before} m, then {after} m"
+        );
+        let half = off(&map, newest / 2);
+        assert!(half < 0.5 * before, "half of the way is {half} m off");
     }
 
     #[test]
