@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use barchan_infer::{
-    BlockMatching, BurnEngine, Contract, DisparityEngine, OnnxEngine, Outlined, Outlines, Runtime,
-    SecondOpinion, SemiGlobal, Threaded,
+    BlockMatching, BurnEngine, Contract, DisparityEngine, InferError, OnnxEngine, Outlined,
+    Outlines, Runtime, SecondOpinion, SemiGlobal, Threaded,
 };
 use barchan_model::{Device, StereoNet, onnx, weights};
 use barchan_train::RunDir;
@@ -36,6 +36,9 @@ pub struct EngineSettings {
     /// half their size [default: full; half where pairs come as a stream]
     #[arg(long, value_enum, value_name = "SIZE")]
     pub second_opinion: Option<OpinionSize>,
+    /// Whether other work goes on meanwhile
+    #[arg(skip)]
+    pub beside_other_work: bool,
 }
 
 /// `--second-opinion`.
@@ -56,14 +59,12 @@ impl EngineSettings {
         }
     }
 
-    /// These, on threads of their own, so that other work does not wait for them.
+    /// These, beside other work, which then does not wait for them.
     pub fn beside_other_work(self) -> Self {
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let threads = match self.threads {
-            0 => cores,
-            threads => threads,
-        };
-        Self { threads, ..self }
+        Self {
+            beside_other_work: true,
+            ..self
+        }
     }
 }
 
@@ -107,10 +108,10 @@ pub fn load_engine(
     settings: &EngineSettings,
 ) -> Result<Box<dyn DisparityEngine>> {
     let engine = load_unlimited(model, runtime, settings)?;
-    Ok(match settings.threads {
-        0 => engine,
-        threads => Box::new(Threaded::new(engine, threads)?),
-    })
+    if settings.threads == 0 && !settings.beside_other_work {
+        return Ok(engine);
+    }
+    Ok(Box::new(Threaded::new(engine, settings.threads)?))
 }
 
 /// [`load_engine`], where all but ONNX Runtime takes as many threads as there are.
@@ -123,6 +124,13 @@ fn load_unlimited(
         return Ok(engine);
     }
     let threads = settings.threads;
+    let load_runtime = || {
+        let runtime = Runtime::load(runtime)?;
+        Ok::<_, InferError>(match settings.beside_other_work {
+            true => runtime.beside_other_work(),
+            false => runtime,
+        })
+    };
     let outlined = |engine: Box<dyn DisparityEngine>| -> Box<dyn DisparityEngine> {
         let opinion = match settings.second_opinion {
             None | Some(OpinionSize::Full) => SecondOpinion::Full,
@@ -140,7 +148,7 @@ fn load_unlimited(
     if path.extension().is_some_and(|e| e == "onnx") {
         // A missing file is the more likely mistake, and the cheaper to find.
         std::fs::metadata(path).with_context(|| format!("{model}: no such model"))?;
-        let runtime = Runtime::load(runtime)?;
+        let runtime = load_runtime()?;
         let engine = OnnxEngine::load(&runtime, path, threads)?;
         let own = *engine.contract() == Contract::own();
         let engine = Box::new(engine);
@@ -152,7 +160,7 @@ fn load_unlimited(
         .iter()
         .any(|(name, _)| model.split(':').next() == Some(name));
     if shipped && (runtime.is_some() || Runtime::find(None).is_ok()) {
-        let runtime = Runtime::load(runtime)?;
+        let runtime = load_runtime()?;
         let bytes = onnx::to_bytes(&net);
         let engine = OnnxEngine::of_export(&runtime, bytes, model, threads)?;
         return Ok(outlined(Box::new(engine)));

@@ -140,6 +140,7 @@ pub fn run(args: Args, output: &Output, runtime: Option<&Path>) -> Result<()> {
         threads: settings.threads,
         outlines: Some(settings.outlines),
         second_opinion: None,
+        beside_other_work: false,
     }
     .streaming();
     let engine = load_engine(&settings.model, runtime, &engines)?;
