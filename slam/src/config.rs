@@ -68,7 +68,8 @@ pub struct SlamConfig {
     /// It is made, too, when so small a share of what a frame could map is in the map: most of what it
     /// sees is new, as behind the crest of a hill, and the map must have it before the old is out of sight.
     pub keyframe_share: f64,
-    /// Frames that may be tracked in the map as it was while a key frame comes into it; 0 waits for it.
+    /// Frames that may be tracked in the map as it was while a key frame comes into it; 0 waits for it, and for its dense
+    /// disparity.
     pub map_lag: usize,
     /// Key frames that bundle adjustment moves.
     pub window: usize,
