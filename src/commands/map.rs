@@ -176,10 +176,20 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         let found = align(&run, &reference, DEFAULT_TOLERANCE)
             .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
         config.levelling = Levelling::Known(found.T_truth_est);
-        // The run knows its first key frame without doubt, and the others against that one. What the fit leaves is
-        // what it may be off everywhere.
-        for covariance in keyframes.iter_mut().filter_map(|k| k.covariance.as_mut()) {
-            *covariance += found.residual;
+        // The run says how far each key frame may be off against the first one. Where there are poses to compare with, what
+        // the fit leaves says how far all are off, which is less where the way is long and more where it began.
+        let times = reference.poses.iter().map(|pose| pose.time);
+        let (first, last) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), t| {
+            (first.min(t), last.max(t))
+        });
+        for keyframe in &mut keyframes {
+            let compared = (first..=last).contains(&keyframe.pose.time);
+            if let Some(covariance) = &mut keyframe.covariance {
+                *covariance = match compared {
+                    true => found.residual,
+                    false => *covariance + found.residual,
+                };
+            }
         }
     }
     let sensor = match noise {
