@@ -285,6 +285,8 @@ pub struct Alignment {
     /// The mean square of what is left: position and rotation vector of the other about the estimate, along the axes
     /// of the estimate's world. Without rotations in the other, those are zero.
     pub residual: Matrix6<f64>,
+    /// How many poses were compared. A motion fits a few poses whatever they are off, and leaves little then.
+    pub poses: usize,
 }
 
 /// The rigid motion `T_truth_est` that brings an estimated trajectory nearest to another, by positions
@@ -338,9 +340,11 @@ pub fn align(
         let residual = Vector6::new(moved.x, moved.y, moved.z, turned.x, turned.y, turned.z);
         residual * residual.transpose()
     });
+    let poses = pairs.T_world_cam_est.len();
     Ok(Alignment {
         T_truth_est,
-        residual: squares.sum::<Matrix6<f64>>() / pairs.T_world_cam_est.len() as f64,
+        residual: squares.sum::<Matrix6<f64>>() / poses as f64,
+        poses,
     })
 }
 
@@ -733,7 +737,7 @@ mod tests {
         };
         let found = align(&estimate, &places, 0.02).unwrap();
         assert_eq!(found.residual.fixed_view::<3, 6>(3, 0).norm(), 0.0);
-        assert!(found.residual[(2, 2)] > 0.0);
+        assert!(found.residual[(2, 2)] > 0.0 && found.poses == 40);
     }
 
     #[test]

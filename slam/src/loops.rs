@@ -612,7 +612,7 @@ mod tests {
                 .take(KEYFRAMES)
                 .collect()
         };
-        // The heading drifts by an eighth of a degree in ten steps, well within what a step may be off.
+        // The heading drifts by 0.2 mrad a step, well within what a step may be off.
         let (truth, estimate) = (poses(0.0), poses(2e-4));
         let mut map = drive(&estimate);
         let rig = RectifiedRig {

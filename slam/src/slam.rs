@@ -295,23 +295,28 @@ impl Slam {
     /// # Errors
     /// When the engine fails.
     pub fn settle(&mut self) -> Result<Vec<Mapped>, SlamError> {
-        let before = self.settle_map()?;
+        let before = self.mapping.settle()?;
         let newest = self.mapping.complete()?;
-        let newest = self.follow(newest);
-        Ok(before.into_iter().chain(newest).collect())
+        let settled = before.into_iter().chain([newest]);
+        let mapped = settled.filter_map(|s| self.follow(s)).collect();
+        self.local = self.newest_local_map();
+        Ok(mapped)
     }
 
     /// Waits until the key frame in hand, if there is one, is in the map; the one before it is through then.
     fn settle_map(&mut self) -> Result<Option<Mapped>, SlamError> {
-        let settled = self.mapping.settle()?;
-        Ok(settled.and_then(|settled| self.follow(settled)))
+        let Some(settled) = self.mapping.settle()? else {
+            return Ok(None);
+        };
+        let mapped = self.follow(settled);
+        self.local = self.newest_local_map();
+        Ok(mapped)
     }
 
-    /// Follows a map that changed.
+    /// What moves with the map under it.
     #[allow(non_snake_case)]
     fn follow(&mut self, settled: Settled) -> Option<Mapped> {
         let Settled { mapped, T_old_new } = settled;
-        self.local = self.newest_local_map();
         self.tracker.map_moved(&T_old_new);
         if let Some(prior) = &mut self.prior {
             prior.map_moved(&T_old_new);

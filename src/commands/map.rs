@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use barchan_eval::trajectory::{DEFAULT_TOLERANCE, align};
+use barchan_eval::trajectory::{Alignment, DEFAULT_TOLERANCE, align};
 use barchan_geometry::registration::{IcpConfig, Reference, register_from_afar};
 use barchan_geometry::{Se3, StampedPose, Trajectory};
 use barchan_terrain::elevation::{BoundsKind, ElevationConfig};
@@ -176,21 +176,7 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         let found = align(&run, &reference, DEFAULT_TOLERANCE)
             .with_context(|| format!("{} and {}", file.display(), args.run.display()))?;
         config.levelling = Levelling::Known(found.T_truth_est);
-        // The run says how far each key frame may be off against the first one. Where there are poses to compare with, what
-        // the fit leaves says how far all are off, which is less where the way is long and more where it began.
-        let times = reference.poses.iter().map(|pose| pose.time);
-        let (first, last) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), t| {
-            (first.min(t), last.max(t))
-        });
-        for keyframe in &mut keyframes {
-            let compared = (first..=last).contains(&keyframe.pose.time);
-            if let Some(covariance) = &mut keyframe.covariance {
-                *covariance = match compared {
-                    true => found.residual,
-                    false => *covariance + found.residual,
-                };
-            }
-        }
+        trust_the_fit(&mut keyframes, &found, &reference);
     }
     let sensor = match noise {
         Some(noise) => noise.sensor(slam.rig.fx, slam.rig.baseline),
@@ -400,6 +386,26 @@ fn read_places(file: &Path) -> Result<Trajectory> {
         });
     }
     Ok(Trajectory { poses })
+}
+
+/// Makes covariances of what the fit to a reference leaves. A run says how far each key frame may be off against the first;
+/// where there are poses to compare with, the fit says how far all are off, which is less where the way was long and
+/// more where it began. Key frames beyond the reference may be off by both, and so may all where the reference has so few
+/// poses that any motion would fit.
+fn trust_the_fit(keyframes: &mut [RunKeyframe], found: &Alignment, reference: &Trajectory) {
+    const ENOUGH: usize = 20;
+    let times = || reference.poses.iter().map(|pose| pose.time);
+    let first = times().fold(f64::INFINITY, f64::min);
+    let last = times().fold(f64::NEG_INFINITY, f64::max);
+    for keyframe in keyframes {
+        let compared = found.poses >= ENOUGH && (first..=last).contains(&keyframe.pose.time);
+        if let Some(covariance) = &mut keyframe.covariance {
+            *covariance = match compared {
+                true => found.residual,
+                false => *covariance + found.residual,
+            };
+        }
+    }
 }
 
 /// Which of the run's key frames the map is made of, and where they are.

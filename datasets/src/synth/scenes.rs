@@ -427,7 +427,7 @@ impl Stage<'_> {
         let centre = self.place();
         let size = self.pixels(centre.z, self.rig.width as f64);
         let [a, b] =
-            [0.12; 2].map(|least| size * least * 3.75f64.powf(self.rng.random_range(0.0..1.0)));
+            std::array::from_fn(|_| 0.12 * size * 3.75f64.powf(self.rng.random_range(0.0..1.0)));
         let c = a.min(b) * self.rng.random_range(0.3..0.8);
         let body = match self.rng.random_range(0..4) {
             0 => Body::Rectangle(a, b),
