@@ -33,7 +33,7 @@ mod write_katwijk;
 
 /// Files of the Katwijk archive that belong to no frame.
 pub mod katwijk {
-    pub use crate::formats::katwijk::{PanTilt, read_ptu, read_rocks};
+    pub use crate::formats::katwijk::{PanTilt, RangeScan, RangeSensor, read_ptu, read_rocks};
 }
 
 pub use calibration::load_rig;

@@ -13,7 +13,8 @@ use crate::{DataError, GnssFix, ImuSample, OdometrySample, Sensors};
 const IMU: (&str, [&str; 7]) = ("imu.csv", ["time", "ax", "ay", "az", "wx", "wy", "wz"]);
 const ODOMETRY: (&str, [&str; 3]) = ("odometry.csv", ["time", "speed", "yaw_rate"]);
 const GNSS: (&str, [&str; 7]) = ("gnss.csv", ["time", "x", "y", "z", "sx", "sy", "sz"]);
-const IMU_POSE: &str = "imu.tum";
+/// How the IMU is mounted.
+pub(crate) const IMU_MOUNT: &str = "imu.tum";
 
 /// Writes the streams that are there.
 pub(crate) fn write_sensors(dir: &Path, sensors: &Sensors) -> Result<(), DataError> {
@@ -33,31 +34,30 @@ pub(crate) fn write_sensors(dir: &Path, sensors: &Sensors) -> Result<(), DataErr
         [s.time, p.x, p.y, p.z, e.x, e.y, e.z]
     });
     write_table(dir, GNSS, gnss)?;
-    write_imu_pose(dir, &sensors.T_imu_cam)
+    write_mount(&dir.join(IMU_MOUNT), &sensors.T_imu_cam)
 }
 
-/// Writes how the IMU is mounted: the pose of the rectified left camera in its frame.
+/// Writes how a sensor is mounted: the pose of the rectified left camera in its frame.
 #[allow(non_snake_case)]
-pub(crate) fn write_imu_pose(dir: &Path, T_imu_cam: &Se3) -> Result<(), DataError> {
+pub(crate) fn write_mount(file: &Path, T_sensor_cam: &Se3) -> Result<(), DataError> {
     let pose = Trajectory {
         poses: vec![StampedPose {
             time: 0.0,
-            T_world_cam: *T_imu_cam,
+            T_world_cam: *T_sensor_cam,
         }],
     };
-    write_whole(&dir.join(IMU_POSE), pose.to_tum().as_bytes())
+    write_whole(file, pose.to_tum().as_bytes())
 }
 
-/// Reads how the IMU is mounted, where a file tells.
-pub(crate) fn read_imu_pose(dir: &Path) -> Result<Option<Se3>, DataError> {
-    let file = dir.join(IMU_POSE);
+/// Reads how a sensor is mounted, where the file is there.
+pub(crate) fn read_mount(file: &Path) -> Result<Option<Se3>, DataError> {
     if !file.is_file() {
         return Ok(None);
     }
-    let poses = Trajectory::read_tum(&file)?.poses;
+    let poses = Trajectory::read_tum(file)?.poses;
     let [pose] = poses.as_slice() else {
         let message = format!("{} lines; one pose is expected", poses.len());
-        return Err(DataError::file(&file, message));
+        return Err(DataError::file(file, message));
     };
     Ok(Some(pose.T_world_cam))
 }
@@ -102,11 +102,11 @@ pub(crate) fn read_sensors(dir: &Path) -> Result<Option<Sensors>, DataError> {
         gnss: gnss.collect(),
         ..Sensors::default()
     };
-    if let Some(T_imu_cam) = read_imu_pose(dir)? {
+    if let Some(T_imu_cam) = read_mount(&dir.join(IMU_MOUNT))? {
         sensors.T_imu_cam = T_imu_cam;
     } else if !sensors.imu.is_empty() {
         return Err(DataError::file(
-            &dir.join(IMU_POSE),
+            &dir.join(IMU_MOUNT),
             "missing: imu.csv needs the pose of the left camera in the IMU's frame, as one TUM line",
         ));
     }

@@ -1,12 +1,13 @@
 use std::path::Path;
 
-use barchan_geometry::Rig;
+use barchan_geometry::{Rig, Se3};
 use chrono::{DateTime, Datelike, Timelike};
-use nalgebra::Point3;
+use image::{DynamicImage, GrayImage, ImageBuffer, Luma};
+use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
-use crate::formats::katwijk::{ZONE, to_utm31};
-use crate::image_file::write_whole;
-use crate::sensor_files::write_imu_pose;
+use crate::formats::katwijk::{RangeSensor, ZONE, to_utm31};
+use crate::image_file::{encode_png, write_whole};
+use crate::sensor_files::{IMU_MOUNT, write_mount};
 use crate::write_folder::{write_beside, write_rgb};
 use crate::{DataError, OdometrySample, StereoSource, Synth};
 
@@ -19,8 +20,9 @@ const RADIUS: f64 = 0.125;
 const TRACK: f64 = 0.8;
 
 /// Writes a rendered traverse in the layout of format `katwijk`: `LocCam/`, `gps-latlong.txt`, `gps-utm31.txt`,
-/// `imu.txt`, `odometry.txt`, `ptu.txt` and `rocks.txt`, with x east and y north; and `rig.toml` and `imu.tum`, for
-/// camera and IMU are not those of the archive. Image
+/// `imu.txt`, `odometry.txt`, `ptu.txt` and `rocks.txt`, with x east and y north; `ToF/` and `Velodyne/` with a scan of either
+/// for every pair, without noise (how much light comes back is that of the sun); and `rig.toml`, `imu.tum`, `tof.tum` and
+/// `velodyne.tum`, for the camera and where the others are mounted are not those of the archive. Image and scan
 /// stamps are `ahead` seconds early: an image shows a place that the fixes reach so much later, the
 /// fault that de Jong 2020 found in the archive (section 9.1).
 ///
@@ -45,11 +47,20 @@ fn write_files(
     mut progress: impl FnMut(usize),
 ) -> Result<(), DataError> {
     let images = dir.join("LocCam");
-    std::fs::create_dir_all(&images).map_err(DataError::io(&images))?;
+    let folders = RangeSensor::ALL.map(|sensor| dir.join(sensor.folder()));
+    for folder in folders.iter().chain([&images]) {
+        std::fs::create_dir_all(folder).map_err(DataError::io(folder))?;
+    }
+    for sensor in RangeSensor::ALL {
+        write_mount(&sensor.mount_file(dir), &T_cam_sensor(sensor).inverse())?;
+    }
     for index in 0..synth.len() {
         let stamp = stamp(dir, synth.time(index) - ahead)?;
         for (side, image) in synth.photograph(index)?.iter().enumerate() {
             write_rgb(&images.join(format!("LocCam_{stamp}_{side}.png")), image)?;
+        }
+        for sensor in RangeSensor::ALL {
+            write_scan(synth, index, sensor, dir, &stamp)?;
         }
         progress(index + 1);
     }
@@ -99,7 +110,7 @@ fn write_files(
         odometry += &" 0".repeat(4 * 3 + 3);
         odometry += "\n";
     }
-    write_imu_pose(dir, &sensors.T_imu_cam)?;
+    write_mount(&dir.join(IMU_MOUNT), &sensors.T_imu_cam)?;
     let still = |s: &OdometrySample| Ok(format!("{} 0 0\n", stamp(dir, s.time)?));
     let ptu = sensors.odometry.iter().map(still);
     let ptu = ptu.collect::<Result<String, DataError>>()?;
@@ -116,6 +127,69 @@ fn write_files(
         write_whole(&dir.join(name), text.as_bytes())?;
     }
     Ok(())
+}
+
+/// Where the range sensors are on the mast: the time-of-flight camera under the cameras, looking as they do; the scanner
+/// above them.
+#[allow(non_snake_case)]
+fn T_cam_sensor(sensor: RangeSensor) -> Se3 {
+    match sensor {
+        RangeSensor::Tof => Se3::translation(0.06, 0.08, 0.0),
+        RangeSensor::Velodyne => {
+            // Forward, left and up.
+            let axes = Matrix3::from_columns(&[Vector3::z(), -Vector3::x(), -Vector3::y()]);
+            let turn =
+                UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+            Se3::from_parts(Vector3::new(0.06, -0.25, 0.0).into(), turn)
+        }
+    }
+}
+
+/// Writes the images of one scan.
+fn write_scan(
+    synth: &Synth,
+    index: usize,
+    sensor: RangeSensor,
+    dir: &Path,
+    stamp: &str,
+) -> Result<(), DataError> {
+    /// Brightness of sunlit sand, as the sensors count light.
+    const SAND: f32 = 150.0;
+    let [width, height] = sensor.size();
+    let place = |k: usize| (k % width, k / width);
+    let azimuth = |k: usize| RangeSensor::azimuth(place(k).0);
+    let ray = |k| {
+        let (column, row) = place(k);
+        sensor.ray(column, row, azimuth(k))
+    };
+    let rays: Vec<Vector3<f64>> = (0..width * height).map(ray).collect();
+    let met = synth.scan(index, &T_cam_sensor(sensor), &rays)?;
+    let brightest = met.iter().flatten().map(|(_, light)| *light);
+    let gain = SAND / brightest.fold(f32::MIN_POSITIVE, f32::max);
+
+    let write = |what: &str, image: DynamicImage| {
+        let name = format!("{}_{stamp}_{what}.png", sensor.folder());
+        let path = dir.join(sensor.folder()).join(name);
+        write_whole(&path, &encode_png(&path, &image)?)
+    };
+    let (w, h) = (width as u32, height as u32);
+    let deep = |value: &dyn Fn(usize) -> u16| {
+        let values = (0..width * height).map(value).collect();
+        // One value a pixel by construction.
+        let grey: Option<ImageBuffer<Luma<u16>, _>> = ImageBuffer::from_raw(w, h, values);
+        DynamicImage::ImageLuma16(grey.unwrap_or_default())
+    };
+    write("range", deep(&|k| sensor.count(met[k].map(|(r, _)| r))))?;
+    let light = |k: usize| met[k].map_or(0.0, |(_, light)| gain * light);
+    match sensor {
+        RangeSensor::Tof => write("intensity", deep(&|k| (4.0 * light(k)) as u16)),
+        RangeSensor::Velodyne => {
+            write("azimuth", deep(&azimuth))?;
+            let levels = (0..width * height).map(|k| light(k) as u8).collect();
+            let grey = GrayImage::from_raw(w, h, levels).unwrap_or_default();
+            write("intensity", DynamicImage::ImageLuma8(grey))
+        }
+    }
 }
 
 /// The time stamp of the archive, `time` seconds after [`START`].
@@ -140,6 +214,7 @@ mod tests {
     use crate::open;
 
     #[test]
+    #[allow(non_snake_case)]
     fn what_is_written_reads_back() {
         let synth = Synth::parse("frames=12,width=64,height=48,rectified=false").unwrap();
         let parent = tempfile::tempdir().unwrap();
@@ -179,6 +254,34 @@ mod tests {
                 read[1] - north - rock.centre.y,
             ];
             assert!(off[0].hypot(off[1]) < 1e-5);
+        }
+        for sensor in RangeSensor::ALL {
+            let scans = sensor.scans(&dir).unwrap();
+            assert_eq!(scans.len(), synth.len());
+            let T_cam_sensor = sensor.T_sensor_cam(&dir).unwrap().unwrap().inverse();
+            let scan = sensor.read(&scans[3].1).unwrap();
+            assert!((scans[3].0 - start - synth.time(3)).abs() < 1e-6);
+            let T_world_cam = synth.true_trajectory().unwrap().poses[3].T_world_cam;
+            let met: Vec<_> = scan.points.iter().flatten().collect();
+            assert!(
+                met.len() > scan.points.len() / 5,
+                "{sensor:?}: {}",
+                met.len()
+            );
+            // What was met is the ground or a rock: no point lies above what is there, and few below, under a rock's side.
+            let above = |p: &&Point3<f64>| {
+                let p = T_world_cam * T_cam_sensor * **p;
+                (p.z - synth.ground_height(p.x, p.y)).abs() < 0.02 + 0.01 * p.coords.norm()
+            };
+            let on_ground = met.iter().filter(|p| above(p)).count();
+            assert!(
+                10 * on_ground > 9 * met.len(),
+                "{sensor:?}: {on_ground} of {}",
+                met.len()
+            );
+            let light = scan.intensity.unwrap();
+            assert_eq!(light.len(), scan.points.len());
+            assert!(light.iter().any(|l| *l > 50));
         }
         assert_eq!(found.odometry.len(), made.odometry.len());
         // The radius is what the fixes make of it, but one for all.

@@ -4,6 +4,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use barchan_datasets::katwijk::RangeSensor;
 use barchan_datasets::{
     Correction, Plane, StereoSource, Synth, disparity_file, load_rig, open, parse_rgb, read_planar,
     write_katwijk, write_synth,
@@ -124,6 +125,16 @@ pub const READERS: &[Reader] = &[
         || KATWIJK.table("gps-latlong.txt"),
     ),
     reader(
+        "katwijk-scans",
+        "Velodyne_2015_11_26_12_00_00_000_range.png",
+        |path, bytes| {
+            let azimuth = "Velodyne_2015_11_26_12_00_00_000_azimuth.png";
+            std::fs::write(path.with_file_name(azimuth), bytes).is_ok()
+                && RangeSensor::Velodyne.read(path).is_ok()
+        },
+        scan,
+    ),
+    reader(
         "onnx",
         "a.onnx",
         |_, b| barchan_onnx::inspect::check(b.to_vec().into()).is_ok(),
@@ -212,6 +223,14 @@ fn plane() -> Plane {
         0 => image::Luma([f32::NAN]),
         _ => image::Luma([0.3 * x as f32 + y as f32]),
     })
+}
+
+/// A short turn of a scanner of 16 lasers.
+fn scan() -> Vec<Vec<u8>> {
+    let ranges = image::ImageBuffer::from_fn(24, 16, |x, y| image::Luma([(x * 900 + y) as u16]));
+    let mut bytes = Cursor::new(vec![]);
+    let written = DynamicImage::ImageLuma16(ranges).write_to(&mut bytes, ImageFormat::Png);
+    written.map_or(vec![], |()| vec![bytes.into_inner()])
 }
 
 fn images() -> Vec<Vec<u8>> {

@@ -202,3 +202,53 @@ fn synth_writes_a_traverse_with_its_ground_or_random_scenes() {
     ]);
     assert!(message.contains("--random-scenes"), "{message}");
 }
+
+#[test]
+fn scans_of_a_beach_become_clouds() {
+    let dir = tempfile::tempdir().unwrap();
+    let part = dir.path().join("part1");
+    let spec = "synth:seed=5,frames=3,width=96,height=64,rectified=false";
+    json(&[
+        "data",
+        "synth",
+        spec,
+        "--layout",
+        "katwijk",
+        "--out",
+        text(&part),
+    ]);
+    let out = dir.path().join("scans");
+    let scans = |more: &[&str]| {
+        let args = ["data", "scans", text(&part), "--out", text(&out)];
+        json(&[&args[..], more].concat())
+    };
+    let found = scans(&[]);
+    assert_eq!(found[0]["sensor"], "ToF");
+    assert_eq!(found[1]["sensor"], "Velodyne");
+    for sensor in [&found[0], &found[1]] {
+        assert_eq!(sensor["scans"], 3);
+        assert!(sensor["points"].as_u64().unwrap() > 3000, "{sensor}");
+    }
+    let cloud = out.join("velodyne/2015_11_26_12_00_00_200.ply");
+    assert!(cloud.is_file() && out.join("tof/2015_11_26_12_00_00_000.ply").is_file());
+
+    // A camera that stands still from noon on: two of three scans lie between its poses.
+    let poses = dir.path().join("poses.tum");
+    std::fs::write(
+        &poses,
+        "1448539200 0 0 0 0 0 0 1\n1448539200.3 0 0 0 0 0 0 1\n",
+    )
+    .unwrap();
+    let joined = scans(&["--poses", text(&poses), "--voxel", "0.1"]);
+    assert_eq!(joined[1]["scans"], 2);
+    let points = |summary: &serde_json::Value| summary["points"].as_u64().unwrap();
+    assert!(points(&joined[1]) > 500 && points(&joined[1]) < points(&found[1]));
+    assert!(out.join("velodyne.ply").is_file());
+
+    std::fs::remove_file(part.join("tof.tum")).unwrap();
+    let args = ["data", "scans", text(&part), "--out", text(&out)];
+    let message = refused(&[&args[..], &["--poses", text(&poses)]].concat());
+    assert!(message.contains("tof.tum"), "{message}");
+    let message = refused(&["data", "scans", text(&out), "--out", text(&part)]);
+    assert!(message.contains("Velodyne_TIME_range.png"), "{message}");
+}

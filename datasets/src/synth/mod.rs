@@ -257,6 +257,37 @@ impl Synth {
         Ok(Plane::from_raw(w as u32, h as u32, values).unwrap_or_default())
     }
 
+    /// What rays of length 1 meet that leave a sensor on the mast of the camera at frame `index`: metres to it, and the
+    /// sunlight that comes back from there, the mean of linear red, green and blue.
+    ///
+    /// # Errors
+    /// When there is no such frame.
+    pub(crate) fn scan(
+        &self,
+        index: usize,
+        T_cam_sensor: &Se3,
+        rays: &[Vector3<f64>],
+    ) -> Result<Vec<Option<(f64, f32)>>, DataError> {
+        /// Width of a beam, radians.
+        const BEAM: f64 = 0.003;
+        let T_world_sensor = self.pose(index)? * T_cam_sensor;
+        let origin = T_world_sensor * Point3::origin();
+        let met = |ray: &Vector3<f64>| {
+            let ray = T_world_sensor.rotation * ray;
+            let hit = self.site.hit(&origin, &ray, NEAR)?;
+            let aside = ray.cross(&Vector3::x()).try_normalize(1e-6);
+            let aside = aside.unwrap_or_else(Vector3::y);
+            let look = Look {
+                origin,
+                ray,
+                eye: origin,
+                steps: [aside * BEAM, ray.cross(&aside) * BEAM],
+            };
+            Some((hit.t, self.site.light(&look, Some(&hit)).mean()))
+        };
+        Ok(rays.par_iter().map(met).collect())
+    }
+
     fn pose(&self, index: usize) -> Result<Se3, DataError> {
         let poses = &self.trajectory.poses;
         let pose = poses

@@ -1,5 +1,6 @@
 mod check;
 mod info;
+mod scans;
 mod synth;
 
 use std::path::PathBuf;
@@ -48,6 +49,7 @@ enum What {
         #[arg(long, value_name = "FILE.toml")]
         out: PathBuf,
     },
+    Scans(scans::Args),
     Synth(synth::Args),
 }
 
@@ -63,6 +65,7 @@ pub fn run(args: Args, output: &Output) -> Result<bool> {
         What::Info(args) => info::run(args, output)?,
         What::Check(args) => return check::run(args, output),
         What::Rectify { data, out } => rectify(&data, out, output)?,
+        What::Scans(args) => scans::run(args, output)?,
         What::Synth(args) => synth::run(args, output)?,
         What::Rig { files, out } => import_rig(&files, out, output)?,
     }

@@ -1,3 +1,4 @@
+mod scans;
 mod tables;
 
 use std::path::{Path, PathBuf};
@@ -9,8 +10,9 @@ use super::{Format, not_here};
 use crate::calibration::{find_calibration, load_rig};
 use crate::listing::{Named, list};
 use crate::pairs::{Calibrated, Pair, PairSource};
-use crate::sensor_files::read_imu_pose;
+use crate::sensor_files::{IMU_MOUNT, read_mount};
 use crate::{DataError, GnssFix, ImuSample, OdometrySample, Sensors};
+pub use scans::{RangeScan, RangeSensor};
 use tables::{Fix, WHEELS, Wheels, read_fixes, read_imu, read_wheels, stamp};
 pub use tables::{PanTilt, read_ptu, read_rocks};
 pub(crate) use tables::{ZONE, to_utm31};
@@ -31,7 +33,8 @@ pub(crate) use tables::{ZONE, to_utm31};
 /// `imu.txt`, `odometry.txt` and the fixes give [`Sensors`]. The IMU is mounted as [`T_imu_loc_cam`] says, or as
 /// an `imu.tum` as of format `folder` beside the text files does. The archive does not tell the size of the
 /// wheels: speed needs the fixes (see [`odometry`]). `ptu.txt` and the positions of rocks are read by
-/// [`read_ptu`](crate::katwijk::read_ptu) and [`read_rocks`](crate::katwijk::read_rocks).
+/// [`read_ptu`](crate::katwijk::read_ptu) and [`read_rocks`](crate::katwijk::read_rocks), range images in `ToF/` and
+/// `Velodyne/` by [`RangeSensor`].
 pub(super) const FORMAT: Format = Format {
     name: "katwijk",
     layout: "LocCam/ with LocCam_YYYY_MM_DD_hh_mm_ss_mmm_0.png (left) and _1.png (right)",
@@ -140,7 +143,7 @@ fn open(dir: &Path, camera: &str, format: &Format, built_in: Rig) -> Result<Pair
     }
     let mounted = || T_imu_loc_cam() * calibrated.R_rect_left().inverse();
     let sensors = Sensors {
-        T_imu_cam: read_imu_pose(dir)?.unwrap_or_else(mounted),
+        T_imu_cam: read_mount(&dir.join(IMU_MOUNT))?.unwrap_or_else(mounted),
         odometry,
         gnss: local(&fixes),
         imu,

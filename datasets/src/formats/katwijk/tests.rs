@@ -210,3 +210,63 @@ fn what_is_broken_is_named_with_its_line() {
         save_text(&path, &before);
     }
 }
+
+#[test]
+fn scans_are_read_by_the_rules_of_the_archive() {
+    let root = tempfile::tempdir().unwrap();
+    let grey = |sensor: RangeSensor, what: &str, value: &dyn Fn(u32, u32) -> u16| {
+        let [width, height] = sensor.size().map(|n| n as u32);
+        let image = image::ImageBuffer::from_fn(width, height, |x, y| image::Luma([value(x, y)]));
+        let folder = root.path().join(sensor.folder());
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join(format!("{}_{}_{what}.png", sensor.folder(), time(15)));
+        image.save(&path).unwrap();
+        path
+    };
+    // Ten metres everywhere, all lasers to the left; the first column met nothing.
+    let velodyne = RangeSensor::Velodyne;
+    let ranges = grey(velodyne, "range", &|x, _| if x == 0 { 0 } else { 10_000 });
+    grey(velodyne, "azimuth", &|_, _| 9000);
+    let found = velodyne.scans(root.path()).unwrap();
+    assert_eq!(found, [(tables::stamp(&time(15)).unwrap(), ranges.clone())]);
+    let scan = velodyne.read(&ranges).unwrap();
+    assert_eq!(
+        (scan.width, scan.height, &scan.intensity),
+        (1808, 16, &None)
+    );
+    assert_eq!(scan.points[1808 * 3], None);
+    // The third row looks 11 degrees up, the last 15 down.
+    let (up, down) = (11.0_f64.to_radians(), -15.0_f64.to_radians());
+    for (row, angle) in [(2, up), (15, down)] {
+        let p = scan.points[1808 * row + 7].unwrap().coords;
+        let expected = Vector3::new(0.0, 10.0 * angle.cos(), 10.0 * angle.sin());
+        assert!((p - expected).norm() < 1e-9, "{p}");
+    }
+    // Half of the reach straight ahead; the largest counts are no ranges.
+    let tof = RangeSensor::Tof;
+    let ranges = grey(tof, "range", &|x, _| if x < 2 { 16380 } else { 8192 });
+    grey(tof, "intensity", &|_, y| y as u16);
+    let scan = tof.read(&ranges).unwrap();
+    assert_eq!(scan.points[176 * 9 + 1], None);
+    let ahead = scan.points[176 * 72 + 88].unwrap();
+    assert!((ahead.coords.norm() - 9.99308193 / 2.0).abs() < 1e-9);
+    assert!(ahead.z > 4.99 && ahead.x > 0.0 && ahead.y > 0.0);
+    // A ray at the right border, half a pixel inside 34.5 degrees.
+    let right = scan.points[176 * 72 + 175].unwrap();
+    let tangent = 34.5_f64.to_radians().tan() * 87.5 / 88.0;
+    assert!((right.x / right.z - tangent).abs() < 1e-9);
+    assert_eq!(scan.intensity.unwrap()[176 * 140], 140);
+    assert!(tof.T_sensor_cam(root.path()).unwrap().is_none());
+
+    let named = |error: DataError, part: &str| {
+        let message = error.to_string();
+        assert!(message.contains(part), "{message}");
+    };
+    named(velodyne.read(&ranges).unwrap_err(), "1808 x 16");
+    std::fs::remove_file(
+        root.path()
+            .join(format!("Velodyne/Velodyne_{}_azimuth.png", time(15))),
+    )
+    .unwrap();
+    named(velodyne.read(&found[0].1).unwrap_err(), "azimuth");
+}
