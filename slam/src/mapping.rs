@@ -176,6 +176,7 @@ impl Mapper {
         if let Some(dense) = dense.as_ref().filter(|_| config.gate) {
             let gate = DisparityGate {
                 disparity: &dense.disparity,
+                sigma: Some(&dense.sigma),
                 threshold: config.gate_px,
             };
             seen.match_stereo(rig, Some(&gate), config);

@@ -48,18 +48,39 @@ pub struct MatchCounts {
 pub struct DisparityGate<'a> {
     /// Dense disparity of the left image, NaN unknown.
     pub disparity: &'a Plane,
+    /// Its standard deviation, where it has one, pixels.
+    pub sigma: Option<&'a Plane>,
     /// Largest difference that still agrees, pixels.
     pub threshold: f64,
 }
 
 impl DisparityGate<'_> {
-    /// Whether the map agrees with a feature's disparity; `None` where it does not know.
+    /// Largest difference of refined disparity and the dense map, pixels: three standard deviations of the network's
+    /// on ground.
+    const REFINED: f64 = 1.0;
+
+    /// Whether the map agrees with a feature's disparity; `None` where it does not know, or where two of its standard
+    /// deviations are more than the threshold.
     pub fn agrees(&self, keypoint: &Keypoint, disparity: f64) -> Option<bool> {
         let (u, v) = (keypoint.u.round() as u32, keypoint.v.round() as u32);
-        let dense = f64::from(self.disparity.get_pixel_checked(u, v)?.0[0]);
-        dense
-            .is_finite()
-            .then(|| (dense - disparity).abs() < self.threshold)
+        let at = |plane: &Plane| Some(f64::from(plane.get_pixel_checked(u, v)?.0[0]));
+        let dense = at(self.disparity)?;
+        let unsure = self
+            .sigma
+            .and_then(at)
+            .is_some_and(|s| 2.0 * s > self.threshold);
+        (dense.is_finite() && !unsure).then(|| (dense - disparity).abs() < self.threshold)
+    }
+
+    /// Whether a disparity refined by correlation is what the map says, too, and is sure of to the same measure: nothing is
+    /// left then of the distance of two key points that lay apart, and a look-alike beside the true place is told from
+    /// it.
+    fn confirms(&self, keypoint: &Keypoint, refined: f64) -> bool {
+        let narrow = Self {
+            threshold: self.threshold.min(Self::REFINED),
+            ..*self
+        };
+        narrow.agrees(keypoint, refined) == Some(true)
     }
 }
 
@@ -68,8 +89,8 @@ impl DisparityGate<'_> {
 /// A candidate lies in the same rows, at most a level of scale away, before the cameras and no nearer than
 /// a disparity of a quarter of the width: no rig of use is focused there. The
 /// nearest neighbour by descriptor is accepted when it is clearly nearer than the second **or** the
-/// gate agrees with it, and refused when the gate contradicts it; the position is then refined by
-/// correlation to a fraction of a pixel.
+/// gate agrees with it. Its position is then refined by correlation to a fraction of a pixel, and the match is refused
+/// where the gate contradicts that.
 pub(crate) fn stereo_matches(
     left: &Features,
     right: &Features,
@@ -107,16 +128,23 @@ pub(crate) fn stereo_matches(
             }
             let coarse = keypoint.u - right.keypoints[best].u;
             let by_ratio = f64::from(distance) < config.nndr * f64::from(second);
-            let rule = match (by_ratio, gate.and_then(|g| g.agrees(keypoint, coarse))) {
-                (true, Some(false)) => {
+            let near = || gate.is_some_and(|g| g.agrees(keypoint, coarse) == Some(true));
+            if !(by_ratio || near()) {
+                return None;
+            }
+            // Two key points of one corner lie up to some pixels apart: what is judged is where the images are alike.
+            let refined = refine_disparity(images, keypoint, coarse)?;
+            let rule = if by_ratio {
+                if gate.and_then(|g| g.agrees(keypoint, refined)) == Some(false) {
                     counts.refused += 1;
                     return None;
                 }
-                (true, _) => &mut counts.ratio,
-                (false, Some(true)) => &mut counts.gate,
-                (false, _) => return None,
+                &mut counts.ratio
+            } else if gate.is_some_and(|g| g.confirms(keypoint, refined)) {
+                &mut counts.gate
+            } else {
+                return None;
             };
-            let refined = refine_disparity(images, keypoint, coarse)?;
             *rule += 1;
             Some(refined)
         })
@@ -460,10 +488,12 @@ mod tests {
             baseline: 0.1,
         };
         let dense = |d: f32| Plane::from_pixel(80, 40, image::Luma([d]));
-        let run = |right_us: &[f64], gate: Option<f32>| {
+        let judged = |right_us: &[f64], gate: Option<f32>, sigma: f32| {
             let map = gate.map(dense);
+            let sigma = dense(sigma);
             let gate = map.as_ref().map(|disparity| DisparityGate {
                 disparity,
+                sigma: Some(&sigma),
                 threshold: 3.0,
             });
             stereo_matches(
@@ -475,6 +505,7 @@ mod tests {
                 &config,
             )
         };
+        let run = |right_us: &[f64], gate: Option<f32>| judged(right_us, gate, 0.3);
         // Two equal candidates: the ratio cannot choose, the gate can.
         let (none, _) = run(&[34.0, 20.0], None);
         assert_eq!(none, [None]);
@@ -486,5 +517,12 @@ mod tests {
         assert!(found[0].is_some() && counts.ratio == 1);
         let (found, counts) = run(&[34.0], Some(30.0));
         assert_eq!((found[0], counts.refused), (None, 1));
+        // Key points 3.5 pixels apart beside disparity, of images that are alike where the map says.
+        let (found, counts) = run(&[30.5], Some(6.0));
+        assert!((found[0].unwrap() - 6.0).abs() < 0.1 && counts.ratio == 1);
+        // A map that is not sure of itself neither refuses nor admits.
+        let (found, counts) = judged(&[34.0], Some(30.0), 1.6);
+        assert!(found[0].is_some() && counts.ratio == 1);
+        assert_eq!(judged(&[34.0, 20.0], Some(6.0), 1.6).0, [None]);
     }
 }

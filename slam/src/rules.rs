@@ -37,6 +37,7 @@ impl MatchRules {
     pub fn judge(&self, left: &Features, right: &Features, dense: &Plane) -> Vec<RuledMatch> {
         let gate = DisparityGate {
             disparity: dense,
+            sigma: None,
             threshold: self.gate_px,
         };
         let judge = |i: usize| {
