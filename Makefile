@@ -29,7 +29,7 @@ TORCH_PINS := tests/peers/requirements-torch.txt scripts/torch_cpu.py scripts/li
 PEERS_TORCH := $(CACHE)/peers-torch-$(shell cat $(TORCH_PINS) | sha256sum | cut -c 1-12)
 
 .DEFAULT_GOAL := help
-.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnxruntime libtorch sample-data fuzz faults load dist clean
+.PHONY: help build run test bench lint smoke tch weights vocabularies peers accuracy peers-torch onnx-weights onnxruntime libtorch sample-data fuzz faults load dist clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -105,6 +105,11 @@ $(PEERS)/ready: tests/peers/requirements.txt
 
 weights: build onnxruntime ## the weights of rover from nothing, into runs/weights; hours; after a stop it goes on
 	scripts/weights.sh "$(BARCHAN)" runs/weights
+
+onnx-weights: build onnxruntime ## checkpoints/rover.onnx and rover-int8.onnx, of the shipped weights
+	$(BARCHAN) export rover --out checkpoints/rover.onnx
+	$(BARCHAN) export rover --int8 --calibrate synth:scenes,seed=99,frames=24,width=320,height=256,bare=3 \
+		--out checkpoints/rover-int8.onnx
 
 accuracy: build onnxruntime $(PEERS)/ready ## MODEL=rover on pairs it never saw, beside OpenCV's SGBM; 100 rendered seeds (5 minutes)
 	$(PEERS)/bin/python tests/peers/accuracy.py --barchan "$(BARCHAN)" --model "$(MODEL)"

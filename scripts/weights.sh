@@ -19,6 +19,7 @@ render() { # NAME SPEC TIMES
 ground=width=384,height=288
 render scenes1 scenes,seed=21,frames=1000,width=320,height=256 1
 render scenes2 scenes,seed=22,frames=1000,width=320,height=256 1
+render bare scenes,seed=23,frames=1200,width=320,height=256,bare=3 1
 render mars seed=31,frames=120,$ground 2
 render arena seed=32,frames=120,look=arena,$ground 2
 render devon seed=33,frames=80,look=devon,texture=low,$ground 2
@@ -26,7 +27,7 @@ render devon seed=33,frames=80,look=devon,texture=low,$ground 2
 if [ -d "$out/run/checkpoints" ]; then
     "$barchan" train --resume "$out/run" --no-check
 else
-    "$barchan" train --preset rover --supervised --distribution 5 --cosine --batch 4 --crop 192 256 \
+    "$barchan" train --preset rover --supervised --distribution 5 --cosine --batch 3 --crop 224 288 \
         --epochs 1000 --steps "$steps" --validate-every 500 --device "$device" --no-check --out "$out/run" \
         --add-disparity 24 --asymmetric 0.3 --erase 0.2 --blur 0.6 --flip-swap 0.4 --flip-vertical 0.2 "${data[@]}"
 fi

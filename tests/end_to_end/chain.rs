@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use barchan_datasets::disparity_file;
+
 use crate::program::{barchan, json, rendered, text};
 
 fn exists(dir: &Path, files: &[&str]) {
@@ -186,4 +188,45 @@ fn a_demo_on_ones_own_images_ends_in_a_page() {
     ]);
     let again = std::fs::read_to_string(again["out"].as_str().unwrap()).unwrap();
     assert!(again.contains("error of the route"));
+}
+
+/// The files for those who run the network without this program.
+#[test]
+fn the_shipped_onnx_files_are_the_shipped_weights() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = rendered(dir.path(), 1);
+    let disparity = |model: &str| {
+        let out = dir.path().join("infer");
+        json(&[
+            "infer",
+            "--data",
+            text(&data),
+            "--model",
+            model,
+            "--outlines",
+            "0",
+            "--no-reject",
+            "--out",
+            text(&out),
+        ]);
+        let folder = out.join("disparity");
+        disparity_file::read(&folder.join("000000.pfm")).unwrap()
+    };
+    let here = disparity("rover");
+    let file = |name: &str| {
+        Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("checkpoints")
+            .join(name)
+    };
+    for (name, most) in [("rover.onnx", 1e-3), ("rover-int8.onnx", 0.1)] {
+        let there = disparity(text(&file(name)));
+        let pixels = here.as_raw().iter().zip(there.as_raw());
+        let mut apart: Vec<f32> = pixels.map(|(a, b)| (a - b).abs()).collect();
+        apart.sort_by(f32::total_cmp);
+        let median = apart[apart.len() / 2];
+        assert!(
+            median < most,
+            "{name}: {median} px; `make onnx-weights` writes it anew"
+        );
+    }
 }

@@ -12,7 +12,7 @@ const RADIUS: usize = 4;
 /// Standard deviation of a pixel that tells nothing against itself, but for sigma; the power of what multiplies it,
 /// the exponents of what is unlike and of what is hidden. All four are fitted to the errors of rendered pairs, the
 /// first so that intervals hold what they should, the others by the likelihood of a Laplace distribution.
-const SCALE: f32 = 0.70;
+const SCALE: f32 = 0.64;
 const POWER: f32 = 0.29;
 const UNLIKE: f32 = 3.56;
 const HIDDEN: f32 = 0.36;
