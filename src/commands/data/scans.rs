@@ -13,7 +13,7 @@ use crate::output::Output;
 #[derive(Parser)]
 #[command(after_help = "Examples:\n  \
     barchan data scans part1 --out scans     a cloud a scan, in the frame of its sensor\n  \
-    barchan data scans part1 --poses runs/k/trajectory.tum --out scans     one cloud a sensor, in the world's frame\n\n\
+    barchan data scans part1 --poses map/keyframes.tum --out scans     one cloud a sensor, in the frame of the map\n\n\
     Read are ToF/ToF_TIME_range.png and Velodyne/Velodyne_TIME_range.png, with _azimuth and _intensity beside them.\n\
     --poses wants to know how a sensor is mounted: tof.tum or velodyne.tum in PART, the pose of the rectified left\n\
     camera in the frame of the sensor, as one line 0 tx ty tz qx qy qz qw.")]
