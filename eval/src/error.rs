@@ -41,8 +41,8 @@ pub enum EvalError {
     },
     /// Too few poses have truth before and after them to tell whether clocks differ.
     #[error(
-        "only {poses} poses have truth for {most:.1} s before and after them, and {fewest} are needed\n  \
-         cure: a smaller largest shift"
+        "the route is too short for differences of up to {most:.1} s: {poses} poses have truth for so long before and after \
+         them, and {fewest} are needed; --max-shift looks for smaller ones"
     )]
     TooShortToShift {
         /// Poses that have.

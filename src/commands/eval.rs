@@ -9,7 +9,7 @@ use barchan_eval::cloud::{CloudScore, score as score_cloud};
 use barchan_eval::disparity::DisparityTally;
 use barchan_eval::time_shift::{TimeShift, time_shift};
 use barchan_eval::trajectory::{DEFAULT_TOLERANCE, TrajectoryScore, score};
-use barchan_eval::{ComparedCell, EvalError, elevation};
+use barchan_eval::{ComparedCell, elevation};
 use barchan_geometry::nalgebra::Point3;
 use barchan_geometry::registration::{IcpConfig, IcpMethod, Reference, Registration, register};
 use barchan_geometry::{Se3, Trajectory};
@@ -345,9 +345,6 @@ fn trajectory(est: &Path, gt: &str, tolerance: f64, max_shift: f64, output: &Out
         .map_or("truth has no rotation".into(), |r| format!("{r:.3} deg/m"));
     let clocks = match &shift {
         None => "not compared".into(),
-        Some(Err(EvalError::TooShortToShift { .. })) => format!(
-            "not compared: the route is too short for differences of up to {max_shift} s; --max-shift looks for smaller ones"
-        ),
         Some(Err(e)) => format!("cannot be compared: {e}"),
         Some(Ok(s)) => format!(
             "the estimate is {:.2} s ahead, give or take {:.2} s (Sim3 ATE {:.4} m, {:.4} m with that mended)",

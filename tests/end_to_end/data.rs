@@ -229,8 +229,8 @@ fn scans_of_a_beach_become_clouds() {
         assert_eq!(sensor["scans"], 3);
         assert!(sensor["points"].as_u64().unwrap() > 3000, "{sensor}");
     }
-    let cloud = out.join("velodyne/2015_11_26_12_00_00_200.ply");
-    assert!(cloud.is_file() && out.join("tof/2015_11_26_12_00_00_000.ply").is_file());
+    let cloud = out.join("velodyne/Velodyne_2015_11_26_12_00_00_200.ply");
+    assert!(cloud.is_file() && out.join("tof/ToF_2015_11_26_12_00_00_000.ply").is_file());
 
     // A camera that stands still from noon on: two of three scans lie between its poses.
     let poses = dir.path().join("poses.tum");

@@ -26,10 +26,7 @@ pub struct Args {
     /// With --poses: edge of a voxel of the joined cloud, metres
     #[arg(long, value_name = "M", default_value_t = 0.05)]
     voxel: f64,
-    /// Takes every n-th scan
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    every: usize,
-    /// The directory that is written: tof/TIME.ply and velodyne/TIME.ply, or tof.ply and velodyne.ply
+    /// The directory that is written: tof/ToF_TIME.ply and velodyne/Velodyne_TIME.ply, or tof.ply and velodyne.ply
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -47,15 +44,12 @@ pub fn run(args: Args, output: &Output) -> Result<()> {
         part,
         poses,
         voxel,
-        every,
         out,
     } = args;
     let poses = (poses.as_deref()).map(Trajectory::read_tum).transpose()?;
     let mut summaries = Vec::new();
     for sensor in RangeSensor::ALL {
-        let scans: Vec<(f64, PathBuf)> = (sensor.scans(&part)?.into_iter())
-            .step_by(every.max(1))
-            .collect();
+        let scans = sensor.scans(&part)?;
         if scans.is_empty() {
             continue;
         }
@@ -99,11 +93,9 @@ fn each(
     for (_, file) in scans {
         let cloud = cloud(sensor, &sensor.read(file)?);
         points += cloud.points.len();
-        // The name of a scan is that of its sensor, a time and `range`.
         let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-        let time = stem.trim_start_matches(sensor.folder());
-        let time = time.trim_matches('_').trim_end_matches("_range");
-        cloud.write_ply(&folder.join(format!("{time}.ply")))?;
+        let name = stem.trim_end_matches("_range");
+        cloud.write_ply(&folder.join(format!("{name}.ply")))?;
         done();
     }
     Ok(Summary {
