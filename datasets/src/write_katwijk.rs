@@ -153,8 +153,8 @@ fn write_scan(
     dir: &Path,
     stamp: &str,
 ) -> Result<(), DataError> {
-    /// Brightness of sunlit sand, as the sensors count light.
-    const SAND: f32 = 150.0;
+    /// The brightest of a scan, as the sensors count light.
+    const BRIGHTEST: f32 = 150.0;
     let [width, height] = sensor.size();
     let place = |k: usize| (k % width, k / width);
     let azimuth = |k: usize| RangeSensor::azimuth(place(k).0);
@@ -165,7 +165,7 @@ fn write_scan(
     let rays: Vec<Vector3<f64>> = (0..width * height).map(ray).collect();
     let met = synth.scan(index, &T_cam_sensor(sensor), &rays)?;
     let brightest = met.iter().flatten().map(|(_, light)| *light);
-    let gain = SAND / brightest.fold(f32::MIN_POSITIVE, f32::max);
+    let gain = BRIGHTEST / brightest.fold(f32::MIN_POSITIVE, f32::max);
 
     let write = |what: &str, image: DynamicImage| {
         let name = format!("{}_{stamp}_{what}.png", sensor.folder());
